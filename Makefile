@@ -1,0 +1,63 @@
+# The vocabulary of the project. `make` or `make help` lists it.
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+PYTHON ?= python3
+PROFILE ?= paper
+RUNS ?= runs
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+# One thread a process: runs and tests share the cores by being several processes.
+export OMP_NUM_THREADS ?= 1
+export PATH := $(CURDIR)/$(BIN):$(PATH)
+
+CELLS := H0 H1 A0 A1 A2 A3 A4
+
+.PHONY: help setup test test-slow lint format demo paper-figures report dashboard sync bench bench-check profile clean
+
+help: ## list these targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
+
+setup: $(READY) ## make .venv with the exact versions of constraints.txt
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if v >= (3, 11) else \
+		f"Python {v[0]}.{v[1]} given, 3.11 or newer needed: make $(MAKECMDGOALS) PYTHON=python3.11")'
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+test: $(READY) ## all tests but the slow ones, in at most 5 minutes on 2 cores
+	python -m pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
+
+test-slow: $(READY) ## the tests that take minutes
+	python -m pytest -n 2 --dist loadfile -m slow $(ARGS)
+
+lint: $(READY) ## style, imports and types
+	ruff check .
+	ruff format --check .
+	mypy
+
+format: $(READY) ## lay out the code
+	ruff check --fix .
+	ruff format .
+
+demo: $(READY) ## the paper's seven experiments on a small robot, seed 1
+	@for cell in $(CELLS); do python run.py profile=quick experiment=$$cell seed=1 output_dir=$(RUNS) || exit $$?; done
+	@python -m analysis $(RUNS)/quick --out results/quick
+
+paper-figures: $(READY) ## every table and figure from the runs of PROFILE (default: paper)
+	python -m analysis $(RUNS)/$(PROFILE) --out results/$(PROFILE)
+
+report: paper-figures ## the same, and where the report lies
+	@echo "open results/$(PROFILE)/report.html"
+
+dashboard: $(READY) ## browse all runs in the terminal, offline
+	python -m acmr.mirror dashboard $(RUNS)/wandb
+
+sync: $(READY) ## send offline runs to a W&B server: make sync BASE_URL=http://HOST:PORT
+	python -m acmr.mirror sync --base-url "$(BASE_URL)" $(RUNS)/wandb
+
+clean: ## remove what tools left; runs and results stay
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist *.egg-info
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
