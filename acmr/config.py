@@ -1,0 +1,216 @@
+"""The settings of one run: their types, and what makes them valid.
+
+Values live in ``conf/``; this module gives them types and checks them once, before anything is created.
+Nothing here knows where a value came from (see :mod:`acmr.compose` for that).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+#: Settings that cannot change what a run computes: they are no part of a run's name.
+NEUTRAL_KEYS = (
+    "device", "threads", "output_dir", "force", "progress", "log_every", "tracking", "profile", "pair",
+    "checkpoint_every", "resume",
+)  # fmt: skip
+
+#: Settings that a teacher must share with its student: its length and the shape of its networks.
+TEACHER_KEYS = ("total_timesteps", "agent.hidden_sizes")
+
+TRACKING_MODES = ("off", "offline", "self_hosted")
+PROGRESS_MODES = ("auto", "bar", "lines", "off")
+EXACT, INEXACT = "exact", "inexact"
+ACTIVATIONS = ("relu", "none")
+
+
+class ConfigError(ValueError):
+    """A setting, or a combination of settings, that cannot be run. Its message is one line for the user."""
+
+    #: What the process that is told this ends with.
+    exit_code = 2
+
+
+@dataclass
+class EnvConfig:
+    """An environment: a Gymnasium id and how the robot's body differs from it."""
+
+    name: str = "???"
+    id: str = "???"
+    #: Name of the environment whose agent teaches in this one (its own name: same body).
+    source: str = "???"
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    remove_bodies: list[str] = field(default_factory=list)
+    drop_sensors: list[int | str] = field(default_factory=list)
+    drop_actuators: list[int | str] = field(default_factory=list)
+    #: Steps an episode may take; None: as registered with Gymnasium.
+    max_episode_steps: int | None = None
+
+
+@dataclass
+class SACConfig:
+    """Soft Actor-Critic, with the paper's values (docs/paper.md)."""
+
+    hidden_sizes: list[int] = field(default_factory=lambda: [256, 256])
+    gamma: float = 0.99
+    tau: float = 0.005
+    batch_size: int = 256
+    buffer_size: int = 1_000_000
+    learning_starts: int = 5_000
+    policy_lr: float = 3e-4
+    q_lr: float = 1e-3
+    policy_frequency: int = 2
+    target_network_frequency: int = 1
+    autotune: bool = True
+    alpha: float = 0.2
+
+
+@dataclass
+class TransferConfig:
+    """What a student takes from its teacher."""
+
+    name: str = "none"
+    #: Path of a teacher file or of a finished run; None: the run of the source environment with the same seed.
+    teacher: str | None = None
+    #: Activation between the new input adapter and the teacher's first layer (``expand`` only).
+    adapter_activation: str = "relu"
+    #: Start from the teacher's temperature instead of log_alpha = 0.
+    copy_log_alpha: bool = False
+    #: Free room for the settings of methods that are added.
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class TrackingConfig:
+    """Where Weights & Biases mirrors a run."""
+
+    mode: str = "offline"
+    project: str = "acmr"
+    entity: str | None = None
+    base_url: str | None = None
+    #: Folder of the offline runs; None: ``<output_dir>/wandb``.
+    dir: str | None = None
+
+
+@dataclass
+class PairConfig:
+    """The two environments that a profile's cells are made of."""
+
+    source: str = "humanoid"
+    target: str = "armless_humanoid"
+
+
+@dataclass
+class ExperimentConfig:
+    """Everything that defines one run."""
+
+    seed: int = 1
+    freeze: bool = False
+    total_timesteps: int = 1_000_000
+    threshold: float = 4900.0
+    consecutive: int = 5
+    device: str = "cpu"
+    threads: int = 1
+    output_dir: str = "runs"
+    force: bool = False
+    progress: str = "auto"
+    #: Environment steps between two rows of metrics.
+    log_every: int = 1_000
+    #: Environment steps between two checkpoints; None: as the length of the run suggests; 0: none are made.
+    checkpoint_every: int | None = None
+    #: ``inexact`` goes on from a checkpoint of another machine or of other versions, and records that.
+    resume: str = EXACT
+    profile: str = "paper"
+    pair: PairConfig = field(default_factory=PairConfig)
+    env: EnvConfig = field(default_factory=EnvConfig)
+    agent: SACConfig = field(default_factory=SACConfig)
+    transfer: TransferConfig = field(default_factory=TransferConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+
+def validate(config: ExperimentConfig) -> None:
+    """Refuses what cannot be run.
+
+    Args:
+        config: The typed settings.
+
+    Raises:
+        ConfigError: With one line that says what was given, what is allowed and what to type.
+    """
+    agent = config.agent
+    _at_least("seed", config.seed, 0)
+    for key in ("total_timesteps", "consecutive", "threads", "log_every"):
+        _at_least(key, getattr(config, key), 1)
+    for key in ("batch_size", "buffer_size", "policy_frequency", "target_network_frequency"):
+        _at_least(f"agent.{key}", getattr(agent, key), 1)
+    _at_least("agent.learning_starts", agent.learning_starts, 0)
+    if config.checkpoint_every is not None:
+        _at_least("checkpoint_every", config.checkpoint_every, 0)
+    if config.env.max_episode_steps is not None:
+        _at_least("env.max_episode_steps", config.env.max_episode_steps, 1)
+    for key in ("policy_lr", "q_lr", "alpha"):
+        _within(f"agent.{key}", getattr(agent, key), low=0.0, high=math.inf, low_open=True)
+    _within("agent.tau", agent.tau, low=0.0, high=1.0, low_open=True)
+    _within("agent.gamma", agent.gamma, low=0.0, high=1.0)
+    if not math.isfinite(config.threshold):
+        raise ConfigError(f"threshold={config.threshold}: a finite return is needed, as in threshold=4900")
+    if not agent.hidden_sizes or min(agent.hidden_sizes) < 1:
+        raise ConfigError(
+            f"agent.hidden_sizes={agent.hidden_sizes}: one or more widths of at least 1 are needed, "
+            "as in agent.hidden_sizes=[256,256]"
+        )
+    _one_of("progress", config.progress, PROGRESS_MODES)
+    _one_of("resume", config.resume, (EXACT, INEXACT))
+    _one_of("tracking.mode", config.tracking.mode, TRACKING_MODES)
+    _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
+    _check_transfer(config)
+    if config.tracking.mode == "self_hosted" and not config.tracking.base_url:
+        raise ConfigError("tracking=self_hosted needs the server's address: tracking.base_url=http://HOST:PORT")
+
+
+def _check_transfer(config: ExperimentConfig) -> None:
+    transfer = config.transfer
+    if transfer.name == "none":
+        if config.freeze:
+            raise ConfigError(
+                "transfer=none freeze=true: without a transfer there is nothing to freeze; "
+                "type transfer=hidden freeze=true or transfer=none freeze=false"
+            )
+        if transfer.teacher is not None:
+            raise ConfigError(
+                f"transfer=none transfer.teacher={transfer.teacher}: without a transfer no teacher is read; "
+                "type transfer=hidden or transfer=expand"
+            )
+        if transfer.copy_log_alpha:
+            raise ConfigError(
+                "transfer=none transfer.copy_log_alpha=true: without a transfer no temperature is copied; "
+                "type transfer=hidden or transfer=expand"
+            )
+    if transfer.name == "direct" and config.freeze:
+        raise ConfigError(
+            "transfer=direct freeze=true: every layer would be frozen and nothing could learn; "
+            "type transfer=direct freeze=false, or evaluate the teacher with python -m acmr.evaluation"
+        )
+    if transfer.name == "hidden" and len(config.agent.hidden_sizes) < 2:
+        raise ConfigError(
+            f"transfer=hidden agent.hidden_sizes={config.agent.hidden_sizes}: there is no layer between two hidden "
+            "layers to transfer; give two widths or more, or type transfer=expand"
+        )
+
+
+def _at_least(key: str, value: int, least: int) -> None:
+    if value < least:
+        raise ConfigError(f"{key}={value}: an integer of at least {least} is needed, as in {key}={max(least, 1)}")
+
+
+def _within(key: str, value: float, *, low: float, high: float, low_open: bool = False) -> None:
+    if not math.isfinite(value) or value < low or value > high or (low_open and value == low):
+        bracket = "(" if low_open else "["
+        upper = "inf)" if math.isinf(high) else f"{high:g}]"
+        raise ConfigError(f"{key}={value}: a number in {bracket}{low:g}, {upper} is needed")
+
+
+def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise ConfigError(f"{key}={value}: must be one of {', '.join(allowed)}")

@@ -1,0 +1,168 @@
+"""From settings to a running Gymnasium environment, or to one line that says why not."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import importlib
+import inspect
+import re
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+from gymnasium.spaces import Box
+
+from acmr.config import ConfigError, EnvConfig
+from acmr.envs.bodies import without_bodies
+from acmr.envs.wrappers import near_matches
+
+#: What MuJoCo says of Gymnasium's own model files, of no use to who runs them.
+_MODEL_REMARK = r"compiler attribute .* is deprecated"
+
+
+def find_spec(env_id: str) -> EnvSpec:
+    """The registration of a Gymnasium id; ``module:Name-v0`` imports the module first, which registers it.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    if env_id == "???":
+        raise ConfigError("env.id is missing: which Gymnasium environment? Type env.id=Hopper-v5, for instance")
+    module, _, name = env_id.rpartition(":")
+    if module:
+        try:
+            importlib.import_module(module)
+        except Exception as error:
+            raise ConfigError(f"env.id={env_id}: cannot import {module}: {one_line(error)}") from error
+    spec = gym.registry.get(name)
+    if spec is None or _is_stub(spec):
+        near = near_matches(name, gym_ids())
+        hint = f"; near: {', '.join(near)}" if near else ""
+        raise ConfigError(f"env.id={env_id}: Gymnasium knows no such environment{hint}")
+    return spec
+
+
+def gym_ids() -> list[str]:
+    """The ids that Gymnasium can make, newest version first."""
+    ids = [name for name, spec in gym.registry.items() if not _is_stub(spec)]
+    return sorted(ids, key=lambda name: gym.registry[name].version or 0, reverse=True)
+
+
+def construct(config: EnvConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
+    """Builds the environment with its body edited and its time limit, without the checks that slow each step down.
+
+    Raises:
+        ConfigError: If it cannot be built, or if its spaces are not what an agent here can use.
+    """
+    spec = copy.copy(find_spec(config.id))
+    creator = _creator(spec)
+    kwargs = dict(config.kwargs)
+    if config.remove_bodies:
+        if not (inspect.isclass(creator) and issubclass(creator, MujocoEnv)):
+            raise ConfigError(
+                f"env.remove_bodies=[{','.join(config.remove_bodies)}]: {config.id} is no MuJoCo environment of "
+                "Gymnasium; only these have bodies to remove. Type env.drop_sensors=[...] instead"
+            )
+        edited: Any = without_bodies(creator, config.remove_bodies)
+        spec.entry_point = edited
+    if render_mode is not None:
+        modes = getattr(creator, "metadata", {}).get("render_modes", [])
+        if render_mode not in modes:
+            raise ConfigError(f"render_mode={render_mode}: {config.id} offers {', '.join(modes) or 'none'}")
+        kwargs["render_mode"] = render_mode
+    spec.order_enforce = False
+    with _quiet_models():
+        try:
+            env = gym.make(spec, max_episode_steps=config.max_episode_steps, disable_env_checker=True, **kwargs)
+        except ConfigError:
+            raise
+        except Exception as error:
+            raise ConfigError(_reason(config, creator, error)) from error
+    _check_spaces(config.id, env)
+    return env
+
+
+def cannot_run(config: EnvConfig, error: Exception) -> ConfigError:
+    """The error of an environment that was built but cannot be reset or stepped."""
+    given = [f"env.id={config.id}"]
+    if config.kwargs:
+        given.append(f"env.kwargs={config.kwargs}")
+    if config.remove_bodies:
+        given.append(f"env.remove_bodies=[{','.join(config.remove_bodies)}]")
+    # What a missing body, site or joint looks like in the environment's own code.
+    needed = config.remove_bodies and isinstance(error, LookupError)
+    why = "its own code needs a part that is gone" if needed else "this environment cannot run"
+    return ConfigError(f"{' '.join(given)}: {why}: {one_line(error)}")
+
+
+def one_line(error: BaseException) -> str:
+    """Type and message of an error, on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+@contextlib.contextmanager
+def _quiet_models() -> Iterator[None]:
+    """Silences remarks about model files, which MuJoCo prints and also writes to a file in the working directory."""
+
+    def relay(message: str) -> None:
+        if not re.match(_MODEL_REMARK, message):
+            warnings.warn(message, stacklevel=2)
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(relay)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", _MODEL_REMARK)
+            yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _creator(spec: EnvSpec) -> Any:
+    if not isinstance(spec.entry_point, str):
+        return spec.entry_point
+    try:
+        return load_env_creator(spec.entry_point)
+    except (ImportError, gym.error.Error) as error:
+        raise ConfigError(f"env.id={spec.id}: {one_line(error)}") from error
+
+
+def _is_stub(spec: EnvSpec) -> bool:
+    """Whether an id only exists to say where its environment went (the v2 and v3 ones)."""
+    return inspect.isfunction(spec.entry_point) and spec.entry_point.__name__.startswith("_raise")
+
+
+def _reason(config: EnvConfig, creator: Any, error: Exception) -> str:
+    unknown = re.search(r"(?:unexpected keyword|multiple values for(?: keyword)?) argument '(\w+)'", str(error))
+    if unknown and unknown[1] in config.kwargs:
+        allowed = [
+            name
+            for name, parameter in inspect.signature(creator).parameters.items()
+            if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+        ]
+        return f"env.kwargs.{unknown[1]}: {config.id} has no such argument; it has {', '.join(allowed) or 'none'}"
+    return str(cannot_run(config, error))
+
+
+def _check_spaces(env_id: str, env: gym.Env[Any, Any]) -> None:
+    for role, space in (("observations", env.observation_space), ("actions", env.action_space)):
+        if not isinstance(space, Box):
+            raise ConfigError(
+                f"env.id={env_id}: its {role} are a {type(space).__name__} space, but only Box spaces "
+                "(arrays of numbers) can be used"
+            )
+    action = env.action_space
+    assert isinstance(action, Box)
+    if not np.issubdtype(action.dtype, np.floating):
+        raise ConfigError(f"env.id={env_id}: its actions are {action.dtype}, but only continuous actions can be used")
+    if not (np.isfinite(action.low).all() and np.isfinite(action.high).all() and (action.low < action.high).all()):
+        raise ConfigError(
+            f"env.id={env_id}: its actions range from {action.low.min():g} to {action.high.max():g}, but each needs a "
+            "finite least and a greater most value"
+        )

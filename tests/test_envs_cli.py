@@ -1,0 +1,116 @@
+"""python -m acmr.envs"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from acmr.config import ConfigError
+from acmr.envs import describe
+from acmr.envs.__main__ import main, read_leaf
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "acmr.envs", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_names_of_one_environment_from_any_folder(tmp_path: Path) -> None:
+    done = run(tmp_path, "armless_humanoid")
+    assert (done.returncode, done.stderr) == (0, "")
+    comments = [line for line in done.stdout.splitlines() if line.startswith("#")]
+    rows = [line.split() for line in done.stdout.splitlines() if not line.startswith("#")]
+    assert "270 observations, 11 actions, 1000 steps an episode" in comments[1]
+    assert "left_foot" in comments[2]
+    assert "arm" not in comments[2]
+    description = describe(read_leaf("armless_humanoid"))
+    assert [row[:3] for row in rows[:270]] == [
+        ["observation", str(index), name] for index, name in enumerate(description.observation_names)
+    ]
+    assert rows[270] == ["action", "0", "abdomen_y", "[-0.4,", "0.4]"]
+    assert len(rows) == 281
+    assert not list(tmp_path.iterdir())
+
+
+def test_list_of_environments(tmp_path: Path) -> None:
+    done = run(tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = {line.split()[0]: line.split()[1:] for line in done.stdout.splitlines()}
+    assert lines["humanoid"][:4] == ["376", "17", "1000", "Humanoid-v4"]
+    assert lines["ant_three_legs"][:3] == ["23", "6", "1000"]
+    assert lines["paper_target"] == ["=", "armless_humanoid"]
+    assert "env.id=Hopper-v5" in lines["gym"]
+
+
+def test_unknown_name(tmp_path: Path) -> None:
+    done = run(tmp_path, "humanod")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: humanod: ")
+    assert "near: humanoid," in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_reader_that_stops_early(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = f"{sys.executable} -u -m acmr.envs humanoid | head -n 1"
+    done = subprocess.run(
+        command, shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith("# humanoid: Humanoid-v4")
+    assert done.stderr == ""
+
+
+def test_gymnasium_ids(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["Hopper-v5"]) == 0
+    shown = capsys.readouterr().out
+    assert "# 11 observations, 3 actions, 1000 steps an episode" in shown
+    assert "observation    0  qpos/rootz\n" in shown
+    assert main(["Pendulum-v1"]) == 0
+    assert "observation    2  obs/2\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("gym", "gym: takes any Gymnasium id"),
+        ("Hoper-v5", "near: Hopper-v5"),
+        ("CartPole-v1", "Discrete"),
+        ("no_such_package:Robot-v0", "cannot import no_such_package"),
+    ],
+)
+def test_errors_are_one_line(name: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([name]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_leaf_builds_on_another(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text("name: base\nid: Ant-v5\nsource: base\nkwargs: {a: 1, b: 2}\n")
+    (tmp_path / "limp.yaml").write_text("defaults: [base]\nname: limp\nkwargs: {b: 3}\ndrop_actuators: [hip_1]\n")
+    config = read_leaf("limp", tmp_path)
+    assert (config.name, config.id, config.source) == ("limp", "Ant-v5", "base")
+    assert config.kwargs == {"a": 1, "b": 3}
+    assert config.drop_actuators == ["hip_1"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("id: Ant-v5\nremove_body: [a]\n", "remove_body is no setting; there are name, id"),
+        ("id: [", "cannot be read"),
+        ("- a\n- b\n", "cannot be read"),
+    ],
+)
+def test_a_damaged_leaf(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "bad.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_leaf("bad", tmp_path)
+    assert "\n" not in str(caught.value)
