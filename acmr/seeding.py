@@ -1,0 +1,58 @@
+"""Independent streams of random numbers, all derived from one seed.
+
+Each consumer draws from a stream of its own, so that adding a draw in one place changes nothing elsewhere.
+No global generator is touched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+
+@dataclass(frozen=True)
+class RandomStreams:
+    """Generators of one run.
+
+    Attributes:
+        networks: Initial weights.
+        acting: Noise of the actions taken in the environment.
+        learning: Noise of the actions sampled in the updates.
+        replay: Indices of the batches.
+        exploration: The uniform random actions before learning starts.
+        environment: Seed of the environment's first reset.
+    """
+
+    networks: torch.Generator
+    acting: torch.Generator
+    learning: torch.Generator
+    replay: np.random.Generator
+    exploration: np.random.Generator
+    environment: int
+
+
+def random_streams(seed: int, device: str = "cpu") -> RandomStreams:
+    """Derives every stream of a run from its seed.
+
+    Args:
+        seed: Any integer >= 0.
+        device: Device on which the learner draws its noise.
+
+    Returns:
+        Streams that are independent of each other, by NumPy's ``SeedSequence.spawn``.
+    """
+    networks, acting, learning, replay, exploration, environment = np.random.SeedSequence(seed).spawn(6)
+    return RandomStreams(
+        networks=_torch_generator(networks, "cpu"),
+        acting=_torch_generator(acting, "cpu"),
+        learning=_torch_generator(learning, device),
+        replay=np.random.default_rng(replay),
+        exploration=np.random.default_rng(exploration),
+        environment=int(environment.generate_state(1)[0]),
+    )
+
+
+def _torch_generator(sequence: np.random.SeedSequence, device: str) -> torch.Generator:
+    return torch.Generator(device).manual_seed(int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1)))

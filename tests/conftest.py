@@ -1,0 +1,42 @@
+"""Fixtures for many tests."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import settings
+
+from acmr.checkpoint import FORMAT_VERSION, Teacher, TeacherDescription, load_teacher, save_teacher
+from acmr.networks import Dimensions, Networks
+
+torch.set_num_threads(1)
+# How long an example takes depends on who shares the machine.
+settings.register_profile("acmr", deadline=None)
+settings.load_profile("acmr")
+
+
+@pytest.fixture
+def teacher_factory(tmp_path: Path) -> Callable[..., Teacher]:
+    """Makes teachers with random weights, saved and loaded as a user's would be."""
+
+    def make(
+        dims: Dimensions, hidden_sizes: tuple[int, ...], seed: int = 99, core: Dimensions | None = None
+    ) -> Teacher:
+        low, high = np.full(dims.action, -1, np.float32), np.full(dims.action, 1, np.float32)
+        networks = Networks(dims, hidden_sizes, low, high, torch.Generator().manual_seed(seed), core)
+        folder = tmp_path / f"teacher-{dims.observation}-{dims.action}-{len(hidden_sizes)}-{seed}-{bool(core)}"
+        folder.mkdir(exist_ok=True)
+        description = TeacherDescription(
+            format_version=FORMAT_VERSION, environment="made_up", environment_id="MadeUp-v0", model_hash="0" * 64,
+            observation_names=[f"obs/{i}" for i in range(dims.observation)],
+            action_names=[f"action/{i}" for i in range(dims.action)],
+            action_low=low.tolist(), action_high=high.tolist(), hidden_sizes=list(hidden_sizes),
+            core=[core.observation, core.action] if core else None, adapter_activation="relu",
+            log_alpha=-1.5, seed=seed, profile="quick", global_step=1234, final_return=5.0, config={},
+        )  # fmt: skip
+        save_teacher(folder, networks, description)
+        return load_teacher(folder)
+
+    return make
