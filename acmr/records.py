@@ -1,0 +1,76 @@
+"""What a run leaves behind, and the one measure that the paper takes from it.
+
+Free of torch, Hydra and W&B, so that the analysis can import it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+#: The first columns of every ``episodes.csv``; a file with only these is complete.
+EPISODE_COLUMNS = ("global_step", "episodic_return", "episode_length")
+#: Further columns, where the environment reports them; ``reward_*`` columns (sums of the reward's terms) follow.
+VELOCITY_COLUMN = "mean_forward_velocity"
+
+#: The paper's experiments: (role of the environment, transfer, freeze) of each (paper, table 2).
+CELLS: dict[str, tuple[str, str, bool]] = {
+    "H0": ("source", "none", False),
+    "H1": ("source", "direct", False),
+    "A0": ("target", "none", False),
+    "A1": ("target", "hidden", False),
+    "A2": ("target", "hidden", True),
+    "A3": ("target", "expand", False),
+    "A4": ("target", "expand", True),
+}
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """One finished episode.
+
+    Attributes:
+        global_step: Environment steps taken in the run when the episode ended, this one's last step included.
+        episodic_return: Sum of the raw rewards.
+        episode_length: Steps in the episode.
+        mean_forward_velocity: Mean ``x_velocity`` over the episode in m/s; None where it is not reported.
+        reward_terms: Sum over the episode of each ``reward_*`` term that the environment reports.
+    """
+
+    global_step: int
+    episodic_return: float
+    episode_length: int
+    mean_forward_velocity: float | None = None
+    reward_terms: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class StepsToThreshold:
+    """Global steps at the end of the last and of the first of the episodes that met the threshold."""
+
+    last: int
+    first: int
+
+
+def steps_to_threshold(
+    global_steps: Sequence[int], returns: Sequence[float], threshold: float, consecutive: int = 5
+) -> StepsToThreshold | None:
+    """The paper's measure: steps until ``consecutive`` episodes running return at least ``threshold``.
+
+    Raw returns, not smoothed (paper, section 4.2). NaN never meets a threshold.
+
+    Args:
+        global_steps: Step at each episode's end, (episodes,), ascending.
+        returns: Raw return of each episode, (episodes,).
+        threshold: Return to reach.
+        consecutive: Episodes that must reach it without a miss between them.
+
+    Returns:
+        The end of the last (the measure) and of the first of these episodes; None if it never happened.
+    """
+    streak = 0
+    for index, value in enumerate(returns):
+        streak = streak + 1 if value >= threshold else 0
+        if streak == consecutive:
+            return StepsToThreshold(int(global_steps[index]), int(global_steps[index - consecutive + 1]))
+    return None

@@ -1,0 +1,183 @@
+"""Settings: every leaf composes, what cannot be run is refused in one line, and a run's name follows from it."""
+
+import itertools
+import math
+import re
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from acmr.compose import CONFIG_FOLDER, compose_config, parse
+from acmr.config import ExperimentConfig, SACConfig
+from acmr.identity import specify, teacher_spec
+from acmr.messages import USER_ERRORS, check_booleans, explain
+from acmr.records import CELLS
+
+LEAVES = [
+    f"{path.parent.name}={path.stem}"
+    for path in sorted(CONFIG_FOLDER.glob("*/*.yaml"))
+    if path.parent.name not in ("hydra",)
+]
+
+
+def spec(*overrides: str):
+    return specify(parse(compose_config(overrides)))
+
+
+def refusal(*overrides: str) -> str:
+    def start() -> None:
+        check_booleans(overrides)
+        spec(*overrides)
+
+    with pytest.raises(USER_ERRORS) as caught:
+        start()
+    line = explain(caught.value)
+    assert "\n" not in line
+    return line
+
+
+@pytest.mark.parametrize("leaf", LEAVES)
+def test_every_leaf_of_every_group_composes(leaf):
+    needs = {
+        "env=gym": ["env.id=Hopper-v5"],
+        "tracking=self_hosted": ["tracking.base_url=http://127.0.0.1:1"],
+    }
+    assert spec(leaf, *needs.get(leaf, [])).config.seed == 1
+
+
+@pytest.mark.parametrize(("profile", "cell"), [*itertools.product(["paper", "quick", "paper_v5"], CELLS)])
+def test_cells_are_those_of_the_paper(profile, cell):
+    made = spec(f"experiment={cell}", f"profile={profile}")
+    role, transfer, freeze = CELLS[cell]
+    assert made.cell == cell
+    assert made.config.env.name == getattr(made.config.pair, role)
+    assert (made.config.transfer.name, made.config.freeze) == (transfer, freeze)
+    assert made.changes == {}
+
+
+def test_paper_profile_has_the_papers_values():
+    config = spec().config
+    assert config.total_timesteps == 1_000_000
+    assert (config.threshold, config.consecutive) == (4900, 5)
+    assert config.agent == SACConfig(
+        hidden_sizes=[256, 256], gamma=0.99, tau=0.005, batch_size=256, buffer_size=1_000_000, learning_starts=5000,
+        policy_lr=3e-4, q_lr=1e-3, policy_frequency=2, target_network_frequency=1, autotune=True, alpha=0.2,
+    )  # fmt: skip
+    assert not config.transfer.copy_log_alpha
+    assert config.transfer.adapter_activation == "relu"
+
+
+def test_python_defaults_say_what_the_paper_profile_says():
+    file = yaml.safe_load((CONFIG_FOLDER / "profile" / "paper.yaml").read_text())
+    defaults = ExperimentConfig()
+    assert file["total_timesteps"] == defaults.total_timesteps
+    for key, value in file["agent"].items():
+        assert math.isclose(float(value), getattr(SACConfig(), key)) if key.endswith("lr") else True
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["sed=1"], "sed: no such setting; did you mean seed?"),
+        (["q_lr=1e-4"], "did you mean agent.q_lr?"),
+        (["trasfer=hidden"], "did you mean transfer"),
+        (["+foo=1"], "foo: no such setting"),
+        (["+agent.foo=1"], "agent.foo: no such setting"),
+        (["transfer=hiden"], "must be one of direct, expand, hidden, none; did you mean transfer=hidden?"),
+        (["env=humanoyd"], "did you mean env=humanoid?"),
+        (["experiment=A9"], "must be one of A0, A1, A2, A3, A4, H0, H1"),
+        (["transfer=none", "freeze=true"], "type transfer=hidden freeze=true or transfer=none freeze=false"),
+        (["transfer=direct", "freeze=true"], "nothing could learn"),
+        (["transfer.teacher=runs/x"], "without a transfer no teacher is read"),
+        (["transfer=hidden", "agent.hidden_sizes=[64]"], "no layer between"),
+        (["total_timesteps=-1"], "total_timesteps=-1: an integer of at least 1"),
+        (["total_timesteps=1e6"], "type total_timesteps=1000000"),
+        (["seed=-1"], "seed=-1: an integer of at least 0"),
+        (["seed=abc"], "seed=abc"),
+        (["freeze=2"], "freeze=2: must be true or false"),
+        (["agent.tau=0"], "agent.tau=0.0: a number in (0, 1]"),
+        (["agent.gamma=1.5"], "agent.gamma=1.5: a number in [0, 1]"),
+        (["agent.q_lr=nan"], "agent.q_lr=nan"),
+        (["agent.hidden_sizes=[]"], "agent.hidden_sizes=[]"),
+        (["agent.hidden_sizes=[64,0]"], "widths of at least 1"),
+        (["agent.batch_size=0"], "agent.batch_size=0"),
+        (["threads=0"], "threads=0"),
+        (["threshold=nan"], "threshold=nan"),
+        (["progress=loud"], "must be one of auto, bar, lines, off"),
+        (["tracking=self_hosted"], "tracking.base_url=http://HOST:PORT"),
+        (["env=gym"], "env.id has no value: type env.id=VALUE"),
+        (["seed=="], "not of the form key=value"),
+        (["env.source=nowhere", "transfer=expand", "output_dir=x"], None),
+    ],
+)
+def test_what_cannot_be_run_is_refused_in_one_line(overrides, says):
+    if says is None:
+        assert spec(*overrides).changes == {"env.source": "nowhere"}
+    else:
+        assert says in refusal(*overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "directory"),
+    [
+        ([], "runs/paper/armless_humanoid-none/seed_1"),
+        (["env=humanoid"], "runs/paper/humanoid-none/seed_1"),
+        (["experiment=H0", "seed=7"], "runs/paper/humanoid-none/seed_7"),
+        (["experiment=A2", "seed=3"], "runs/paper/armless_humanoid-hidden-frozen/seed_3"),
+        (["transfer=hidden", "freeze=true", "seed=3"], "runs/paper/armless_humanoid-hidden-frozen/seed_3"),
+        (["experiment=A4", "profile=quick"], "runs/quick/ant_three_legs-expand-frozen/seed_1"),
+        (["agent.q_lr=1e-4"], "runs/paper/armless_humanoid-none-q_lr=0.0001/seed_1"),
+        (["agent.q_lr=0.001"], "runs/paper/armless_humanoid-none/seed_1"),
+        (["agent.hidden_sizes=[64,64]"], "runs/paper/armless_humanoid-none-hidden_sizes=64+64/seed_1"),
+        (["device=cuda", "threads=2", "tracking=off", "progress=off", "log_every=7"],
+         "runs/paper/armless_humanoid-none/seed_1"),
+        (["env=gym", "env.id=Hopper-v5", "output_dir=elsewhere"], "elsewhere/paper/Hopper-v5-none/seed_1"),
+        (["env=gym", "env.id=Hopper-v5", "env.drop_sensors=[0,3]"],
+         "runs/paper/Hopper-v5-none-drop_sensors=0+3/seed_1"),
+        (["seed=123456789012345678901234567890"],
+         "runs/paper/armless_humanoid-none/seed_123456789012345678901234567890"),
+    ],
+)  # fmt: skip
+def test_a_run_has_one_directory(overrides, directory):
+    assert str(spec(*overrides).directory) == directory
+
+
+def test_long_values_are_hashed_and_stay_apart():
+    names = {spec("env=humanoid", f"env.drop_sensors=['qpos/{joint}/*']").name for joint in "abc"}
+    assert len(names) == 3
+    assert all(re.fullmatch(r"humanoid-none-drop_sensors=[0-9a-f]{8}", name) for name in names)
+
+
+def test_a_cell_with_other_settings_is_not_the_papers():
+    assert spec("experiment=A2", "agent.q_lr=1e-4").cell is None
+    assert spec("experiment=A2", "transfer.adapter_activation=none").cell is None
+    assert spec("env=humanoid", "transfer=hidden").cell is None
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10**12), st.sampled_from(["none", "hidden", "expand"]), st.booleans(), st.integers(1, 10**7))
+def test_the_command_of_a_run_leads_back_to_it(seed, transfer, freeze, steps):
+    freeze = freeze and transfer != "none"
+    made = spec(f"seed={seed}", f"transfer={transfer}", f"freeze={freeze}", f"total_timesteps={steps}")
+    again = spec(*made.command.split()[2:])
+    assert again.directory == made.directory
+
+
+@pytest.mark.parametrize(
+    ("overrides", "command"),
+    [
+        (["experiment=A2", "seed=3"], "python run.py env=humanoid seed=3"),
+        (["experiment=A2", "profile=quick"], "python run.py profile=quick env=ant seed=1"),
+        (["experiment=A1", "total_timesteps=20000"], "python run.py env=humanoid total_timesteps=20000 seed=1"),
+        (["experiment=A1", "agent.q_lr=1e-4"], "python run.py env=humanoid seed=1"),
+        (["env=gym", "env.id=Hopper-v5", "env.drop_sensors=[0]", "transfer=expand"],
+         "python run.py env=gym env.id=Hopper-v5 seed=1"),
+    ],
+)  # fmt: skip
+def test_a_students_teacher_is_the_source_run_of_its_seed(overrides, command):
+    teacher = teacher_spec(spec(*overrides).config)
+    assert teacher.command == command
+    assert teacher.config.transfer.name == "none"
+    assert spec(*command.split()[2:]).directory == teacher.directory
