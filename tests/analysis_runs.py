@@ -1,0 +1,153 @@
+"""Lays out run directories as runs leave them, for the tests of the analysis (helpers, no tests)."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from acmr.records import CELLS
+
+PAIRS = {"paper": ("humanoid", "armless_humanoid"), "quick": ("ant", "ant_three_legs")}
+HEADER = "global_step,episodic_return,episode_length,mean_forward_velocity,reward_forward,reward_survive"
+
+
+def run_directory(root: Path, cell: str, seed: int, profile: str = "paper") -> Path:
+    role, transfer, freeze = CELLS[cell]
+    env = PAIRS[profile][role == "target"]
+    return root / (f"{env}-{transfer}" + ("-frozen" if freeze else "")) / f"seed_{seed}"
+
+
+def settings(cell: str, seed: int, profile: str, total: int, threshold: float) -> dict:
+    role, transfer, freeze = CELLS[cell]
+    source, target = PAIRS[profile]
+    return {
+        "seed": seed,
+        "freeze": freeze,
+        "total_timesteps": total,
+        "threshold": threshold,
+        "consecutive": 5,
+        "threads": 1,
+        "profile": profile,
+        "pair": {"source": source, "target": target},
+        "env": {"name": source if role == "source" else target, "id": "Humanoid-v4"},
+        "agent": {"q_lr": 0.001, "learning_starts": total // 200, "hidden_sizes": [256, 256]},
+        "transfer": {"name": transfer, "teacher": None},
+    }
+
+
+def rows_reaching(steps: float | None, total: int, threshold: float = 4900.0, length: int = 100) -> np.ndarray:
+    """Episodes (step, return, length) whose fifth in a row at the threshold ends exactly at ``steps`` (None: never)."""
+    last = int(steps) if steps is not None else total
+    ends = [last - k * length for k in range(5)]
+    assert ends[-1] > 0
+    early = np.arange(length, ends[-1], length)
+    late = np.arange(last + length, total + 1, length)
+    ends = np.concatenate([early, ends[::-1], late]).astype(int)
+    low = (ends < last - 4 * length) if steps is not None else np.ones(len(ends), bool)
+    returns = np.where(low, threshold - 1 - 1000.0 / ends, threshold)
+    return np.column_stack([ends, returns, np.diff(ends, prepend=0)])
+
+
+def realistic_rows(
+    rng: np.random.Generator, total: int, half: float, top: float = 5600.0, noise: float = 0.12
+) -> np.ndarray:
+    """A learning curve: short, bad episodes first, then longer ones; half the return is reached at step ``half``."""
+    rows, step = [], 0
+    while True:
+        level = 1 / (1 + math.exp(-6 * (step - half) / max(half, 1)))
+        level = min(1.0, max(0.0, 0.01 + level))
+        length = int(np.clip(1000 * level * (1 + 2 * noise * rng.standard_normal()), 15, 1000))
+        if length > 950:
+            length = 1000
+        step += length
+        if step > total:
+            return np.array(rows)
+        speed = 3 * level * (1 + noise * rng.standard_normal())
+        rows.append((step, 5.0 * length * (0.85 + 0.15 * level * (top / 5000)) + 90 * speed, length, speed))
+
+
+def csv_text(rows: np.ndarray, columns: int = 6) -> str:
+    names = HEADER.split(",")[:columns]
+    lines = [",".join(names)]
+    for row in rows:
+        speed = row[3] if len(row) > 3 else 1.5
+        values = [int(row[0]), float(row[1]), int(row[2]), float(speed), float(row[1]) * 0.2, float(row[1]) * 0.8]
+        lines.append(",".join(repr(value) for value in values[:columns]))
+    return "\n".join(lines) + "\n"
+
+
+def write_run(
+    root: Path,
+    cell: str,
+    seed: int,
+    rows: np.ndarray,
+    *,
+    profile: str = "paper",
+    total: int = 1_000_000,
+    threshold: float = 4900.0,
+    summary: dict | bool = True,
+    **more: object,
+) -> Path:
+    """Lays out a run's directory as a run leaves it; ``summary=False``: unfinished; a dict: additions to it."""
+    directory = run_directory(root, cell, seed, profile)
+    directory.mkdir(parents=True)
+    config = settings(cell, seed, profile, total, threshold) | more
+    (directory / "config.yaml").write_text(yaml.safe_dump(config))
+    (directory / "episodes.csv").write_text(csv_text(rows))
+    (directory / "run.log").write_text("started\n")
+    if summary is not False:
+        _, transfer, freeze = CELLS[cell]
+        content = {
+            "status": "complete",
+            "cell": cell,
+            "env": config["env"]["name"],
+            "transfer": transfer,
+            "freeze": freeze,
+            "seed": seed,
+            "profile": profile,
+            "run": directory.parent.name,
+            "global_step": total,
+            "total_timesteps": total,
+            "episodes": len(rows),
+            "threshold": threshold,
+            "consecutive": 5,
+            "steps_per_second": 110.0 + seed,
+            "wall_seconds": total / (110.0 + seed),
+            "versions": {"torch": "2.13.0"},
+            "git_commit": "0123456",
+            "machine": "node-1",
+        }
+        (directory / "summary.json").write_text(json.dumps(content | (summary if isinstance(summary, dict) else {})))
+    return directory
+
+
+def write_matrix(
+    root: Path,
+    times: dict[str, Sequence[float | None]],
+    total: int = 1_000_000,
+    length: int = 1000,
+    profile: str = "paper",
+) -> None:
+    """Runs whose steps to threshold are the ones given, seeds from 1 on."""
+    for cell, values in times.items():
+        for seed, steps in enumerate(values, start=1):
+            write_run(root, cell, seed, rows_reaching(steps, total, length=length), total=total, profile=profile)
+
+
+def write_realistic(
+    root: Path, seeds: Sequence[int] = (1, 2, 3), total: int = 1_000_000, profile: str = "paper"
+) -> None:
+    """All seven cells with curves like the paper's; A4 never reaches."""
+    half = {"H0": 0.42, "H1": 0.1, "A0": 0.4, "A1": 0.38, "A2": 0.28, "A3": 0.27, "A4": 0.7}
+    for cell, share in half.items():
+        for seed in seeds:
+            rng = np.random.default_rng([seed, sum(map(ord, cell))])
+            rows = realistic_rows(rng, total, share * total * (1 + 0.06 * rng.standard_normal()))
+            if cell == "A4":
+                rows[:, 1] *= 0.12 + 0.05 * rng.random()
+            write_run(root, cell, seed, rows, total=total, profile=profile)
