@@ -11,9 +11,8 @@ READY := $(VENV)/.ready
 export OMP_NUM_THREADS ?= 1
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-CELLS := H0 H1 A0 A1 A2 A3 A4
 
-.PHONY: help setup test test-slow lint format demo paper-figures report dashboard sync bench bench-check profile clean
+.PHONY: help setup test test-slow torture lint format demo paper status paper-figures report dashboard sync bench bench-check profile clean
 
 help: ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
@@ -42,9 +41,16 @@ format: $(READY) ## lay out the code
 	ruff check --fix .
 	ruff format .
 
-demo: $(READY) ## the paper's seven experiments on a small robot, seed 1
-	@for cell in $(CELLS); do python run.py profile=quick experiment=$$cell seed=1 output_dir=$(RUNS) || exit $$?; done
-	@python -m analysis $(RUNS)/quick --out results/quick
+demo: $(READY) ## the paper's 21 runs on a small robot: minutes; again: only what is missing
+	python run.py matrix=quick output_dir=$(RUNS)
+	@python -m analysis $(RUNS)/quick --out results/quick --if-changed
+
+paper: $(READY) ## the paper's 21 runs, a million steps each, then its tables and figures; a day on 2 cores
+	python run.py matrix=paper output_dir=$(RUNS)
+	@python -m analysis $(RUNS)/paper --out results/paper
+
+status: $(READY) ## what every run is doing; fails if one failed
+	@python -m sweeps.status $(RUNS)
 
 paper-figures: $(READY) ## every table and figure from the runs of PROFILE (default: paper)
 	python -m analysis $(RUNS)/$(PROFILE) --out results/$(PROFILE)
@@ -57,6 +63,19 @@ dashboard: $(READY) ## browse all runs in the terminal, offline
 
 sync: $(READY) ## send offline runs to a W&B server: make sync BASE_URL=http://HOST:PORT
 	python -m acmr.mirror sync --base-url "$(BASE_URL)" $(RUNS)/wandb
+
+bench: $(READY) ## our learner beside Stable-Baselines3 and SBX, and beside what the core can do
+	python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
+	python -m bench.speed
+
+bench-check: $(READY) ## the same, and fail if a ratio falls under its target
+	python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
+	python -m bench.speed --check
+	python -m bench.memory --check
+	python -m bench.cores --check
+
+profile: $(READY) ## where the time of a training step goes
+	python -m bench.profile_step
 
 clean: ## remove what tools left; runs and results stay
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist *.egg-info

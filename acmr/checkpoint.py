@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +21,14 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from acmr.config import ConfigError
+from acmr.config import ACTIVATIONS, ConfigError
 from acmr.durable import write_bytes
 from acmr.networks import Dimensions, Networks
 from acmr.run_dir import DESCRIPTION_FILE, TENSOR_FILE
 
 FORMAT_VERSION = 1
-#: A description larger than this is not one of ours.
-_MAX_DESCRIPTION_BYTES = 4 << 20
+#: Files larger than this, and layers wider, are none of ours.
+_MAX_DESCRIPTION_BYTES, _MAX_TENSOR_BYTES, _MAX_WIDTH = 4 << 20, 1 << 30, 1 << 20
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class TeacherDescription:
         final_return: Mean return of its last episodes; None if it finished none.
         config: All settings of the run.
         sha256: Of the tensor file.
+        description_sha256: Of all other entries of this description.
     """
 
     format_version: int
@@ -72,6 +75,7 @@ class TeacherDescription:
     final_return: float | None
     config: dict[str, Any]
     sha256: str = ""
+    description_sha256: str = ""
 
     @property
     def dims(self) -> Dimensions:
@@ -102,11 +106,15 @@ class Teacher:
         try:
             networks.load_state_dict(self.tensors)
         except RuntimeError as error:
-            raise ConfigError(
-                f"{self.path}: the tensors do not fit the layers that {DESCRIPTION_FILE} describes; "
-                "the two files are not of one run"
-            ) from error
+            raise self.misfit() from error
         return networks
+
+    def misfit(self) -> ConfigError:
+        """The error of a teacher whose two files do not belong together."""
+        return ConfigError(
+            f"{self.path}: the tensors do not fit the layers that {DESCRIPTION_FILE} describes; "
+            "the two files are not of one run"
+        )
 
 
 def save_teacher(folder: Path, networks: Networks, description: TeacherDescription) -> None:
@@ -114,6 +122,7 @@ def save_teacher(folder: Path, networks: Networks, description: TeacherDescripti
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in networks.state_dict().items()}
     data = save_tensors(tensors)
     content = asdict(description) | {"sha256": hashlib.sha256(data).hexdigest()}
+    content["description_sha256"] = _description_sha256(content)
     write_bytes(folder / TENSOR_FILE, data)
     write_bytes(folder / DESCRIPTION_FILE, (json.dumps(content, indent=2) + "\n").encode())
 
@@ -140,6 +149,8 @@ def load_teacher(path: str | Path) -> Teacher:
     if not beside.is_file():
         raise ConfigError(f"{path}: {beside.name} is missing beside it; a teacher is both files of a run")
     description = _read_description(beside)
+    if path.stat().st_size > _MAX_TENSOR_BYTES:
+        raise ConfigError(f"{path}: {path.stat().st_size} bytes; not the networks of a teacher of this project")
     data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != description.sha256:
         raise ConfigError(
@@ -151,6 +162,9 @@ def load_teacher(path: str | Path) -> Teacher:
     except (SafetensorError, KeyError, ValueError) as error:
         raise ConfigError(f"{path}: not a safetensors file ({error})") from error
     teacher = Teacher(path, description, tensors)
+    # Before anything of the size that the description claims is made.
+    if sum(tensor.numel() for tensor in tensors.values()) != _parameter_count(description):
+        raise teacher.misfit()
     teacher.build_networks()
     return teacher
 
@@ -164,7 +178,69 @@ def _read_description(path: Path) -> TeacherDescription:
         raise ConfigError(f"{path}: not readable as JSON ({error})") from error
     if not isinstance(content, dict) or content.get("format_version") != FORMAT_VERSION:
         raise ConfigError(f"{path}: not a teacher description of format {FORMAT_VERSION}")
-    missing = [entry.name for entry in fields(TeacherDescription) if entry.name not in content]
+    names = [entry.name for entry in fields(TeacherDescription) if entry.name != "description_sha256"]
+    missing = [name for name in names if name not in content]
     if missing:
         raise ConfigError(f"{path}: the entries {', '.join(missing)} are missing")
-    return TeacherDescription(**{entry.name: content[entry.name] for entry in fields(TeacherDescription)})
+    if unknown := content.keys() - {*names, "description_sha256"}:
+        raise ConfigError(f"{path}: damaged (it has the unknown entries {', '.join(sorted(unknown))}); copy it again")
+    if content.get("description_sha256", _description_sha256(content)) != _description_sha256(content):
+        raise ConfigError(f"{path}: damaged (its entries do not have the sha256 that stands in it); copy it again")
+    description = TeacherDescription(**{name: content[name] for name in names})
+    wrong = _wrong_entries(description)
+    if wrong:
+        raise ConfigError(f"{path}: the entries {', '.join(wrong)} are not what a teacher description holds")
+    return description
+
+
+def _description_sha256(content: dict[str, Any]) -> str:
+    rest = {name: value for name, value in content.items() if name != "description_sha256"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def _wrong_entries(about: TeacherDescription) -> list[str]:
+    """Names of the entries whose values could not have been written by :func:`save_teacher`."""
+
+    def list_of(value: object, kind: type, least: int = 1) -> bool:
+        return isinstance(value, list) and len(value) >= least and all(type(entry) is kind for entry in value)
+
+    def widths(value: object) -> bool:
+        return list_of(value, int) and isinstance(value, list) and all(0 < entry <= _MAX_WIDTH for entry in value)
+
+    def bounds(value: object) -> bool:
+        fits = list_of(value, float) and isinstance(value, list) and len(value) == len(about.action_names)
+        return fits and isinstance(value, list) and all(math.isfinite(entry) for entry in value)
+
+    texts = ("environment", "environment_id", "model_hash", "profile", "sha256")
+    good = {
+        "observation_names": list_of(about.observation_names, str),
+        "action_names": list_of(about.action_names, str),
+        "action_low": bounds(about.action_low),
+        "action_high": bounds(about.action_high),
+        "hidden_sizes": widths(about.hidden_sizes),
+        "core": about.core is None or (widths(about.core) and len(about.core) == 2),
+        "log_alpha": isinstance(about.log_alpha, int | float) and math.isfinite(about.log_alpha),
+        "seed": type(about.seed) is int,
+        "global_step": type(about.global_step) is int,
+        "final_return": about.final_return is None or isinstance(about.final_return, int | float),
+        "adapter_activation": about.adapter_activation in ACTIVATIONS,
+        "config": isinstance(about.config, dict),
+        **{name: isinstance(getattr(about, name), str) for name in texts},
+    }
+    return [name for name, is_good in good.items() if not is_good]
+
+
+def _parameter_count(about: TeacherDescription) -> int:
+    """Numbers in the networks that a description describes."""
+    dims, inner = about.dims, Dimensions(*about.core) if about.core else about.dims
+
+    def trunk(given: int, taken: int) -> int:
+        widths = [taken, *about.hidden_sizes]
+        adapter = (given + 1) * taken if about.core else 0
+        return adapter + sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths))
+
+    last = about.hidden_sizes[-1] + 1
+    actor = trunk(dims.observation, inner.observation) + 2 * last * inner.action
+    if about.core:
+        actor += 2 * (inner.action + 1) * dims.action
+    return actor + 2 * (trunk(dims.observation + dims.action, inner.observation + inner.action) + last)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from types import CodeType
 
@@ -16,11 +17,12 @@ import torch
 
 from acmr.provenance import machine, versions
 
-#: Libraries and parts of this program whose change changes results.
+#: Libraries whose change changes results.
 _LIBRARIES = ("python", "torch", "numpy", "gymnasium", "mujoco")
-_SOURCES = (
-    "envs/bodies.py", "envs/construct.py", "envs/state.py", "envs/wrappers.py", "learner_*.py", "matmul.py",
-    "networks.py", "replay_buffer.py", "run_state.py", "sac.py", "seeding.py", "trainer.py", "transfer.py",
+#: Parts of this program that only name, show or send a run; any other part may decide what it computes.
+_ASIDE = frozenset(
+    ("compose", "disk", "evaluation", "heartbeat", "identity", "messages", "mirror", "progress", "provenance",
+     "stopping", "summary", "tracking", "video", "wandb_backend", "features", "__main__")
 )  # fmt: skip
 
 
@@ -89,10 +91,11 @@ def _computations() -> bytes:
     return b"".join(result.numpy().tobytes() for result in results) + alone.tobytes() + np.tanh(alone).tobytes()
 
 
+@cache
 def _program() -> bytes:
     """What the sources that decide results compile to, without comments, docstrings and positions."""
     folder = Path(__file__).resolve().parent
-    paths = sorted({path for pattern in _SOURCES for path in folder.glob(pattern)})
+    paths = sorted(path for path in folder.rglob("*.py") if path.stem not in _ASIDE)
     codes = [compile(path.read_bytes(), path.name, "exec", optimize=2, dont_inherit=True) for path in paths]
     return "\n".join(f"{path.name} {_meaning(code)}" for path, code in zip(paths, codes, strict=True)).encode()
 

@@ -89,6 +89,8 @@ class RunState:
         trainer, arrays = self.trainer, snapshot.arrays
         trainer.global_step = int(values["global_step"])
         trainer.observation = arrays.get(_OBSERVATION)
+        if trainer.observation is not None and trainer.observation.shape != trainer.env.observation_space.shape:
+            raise ValueError(f"an observation of shape {trainer.observation.shape}")
         self.files.load(snapshot.files, values["added"], values["ended"], trainer.observation)
         trainer.agent.load_state_dict(_agent_state(arrays, values["learner"]))
         trainer.streams.replay.bit_generator.state = values["replay"]

@@ -1,6 +1,6 @@
 """Soft Actor-Critic (Haarnoja et al. 2018) as the paper ran it.
 
-The passes through the networks are written out (:mod:`acmr.learner_layers`) and share what they can without changing
+The passes through the networks are written out (:mod:`acmr.learner.layers`) and share what they can without changing
 a value; ``tests/reference_sac.py`` says the same plainly, with autograd, and the tests hold the two together.
 """
 
@@ -16,10 +16,10 @@ import torch
 from torch import Tensor, nn
 
 from acmr.config import SACConfig
-from acmr.learner_arrays import Array, array_of, math_of, tensor_of
-from acmr.learner_layers import CriticStack, Stack, columns
-from acmr.learner_parameters import Adam, FlatParameters, Group
-from acmr.learner_policy import Acting, Sample, SquashedGaussian
+from acmr.learner.arrays import Array, array_of, math_of, tensor_of
+from acmr.learner.layers import CriticStack, Stack, columns
+from acmr.learner.parameters import Adam, FlatParameters, Group
+from acmr.learner.policy import Acting, Sample, SquashedGaussian
 from acmr.networks import Actor, Critic, Networks, Trunk
 from acmr.replay_buffer import Batch, JoinedBatch
 
@@ -82,8 +82,8 @@ class SAC:
         self._critics = CriticStack(self._critic_parameters.blocks, relus, dims.observation)
         self._targets = CriticStack(self._target_parameters.blocks, relus, dims.observation)
         self._policy = SquashedGaussian(actor.action_scale, actor.action_bias)
-        on_cpu = self.device == "cpu"
-        self._acting = Acting(self._actor.layers, actor.action_scale, actor.action_bias) if on_cpu else None
+        in_numpy = self._math is np
+        self._acting = Acting(self._actor.layers, actor.action_scale, actor.action_bias) if in_numpy else None
 
     @torch.no_grad()
     def act(self, observation: np.ndarray) -> np.ndarray:

@@ -87,6 +87,8 @@ class BufferFiles:
         buffer.added, buffer.ended = added, ended
         for segment in reversed(segments):
             ended = self._read(segment, added, ended)
+        if not 0 <= ended <= expected:
+            raise DamagedError(f"{self._folder}: the replay buffer has other episodes than were counted")
         if newest is not None:
             buffer.rows[added % len(buffer.rows), : buffer.observation_dim] = newest
         self._segments = segments

@@ -3,3 +3,6 @@
 ``python -m analysis RUNS --out OUT`` is the whole of it (:mod:`analysis.cli`). The way of a number is
 :mod:`analysis.load` -> :mod:`analysis.metrics` -> :mod:`analysis.comparisons` -> :mod:`analysis.tables`.
 """
+
+#: File formats of the figures.
+FORMATS = ("pdf", "png", "svg")

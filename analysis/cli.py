@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-FORMATS = ("pdf", "png", "svg")
+from analysis import FORMATS
 
 
 class _Parser(argparse.ArgumentParser):
@@ -35,6 +36,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run(options)
     except InputError as error:
         print(f"analysis: {error}", file=sys.stderr)
+    except BrokenPipeError:  # whoever read the output has closed it, as in "| head"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except OSError as error:
         print(f"analysis: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
     except KeyboardInterrupt:
@@ -52,18 +56,31 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--out", type=Path, metavar="OUT", help="folder for the results (default: results/<name of RUNS>)"
     )
-    parser.add_argument("--threshold", type=_finite, help="return to reach (default: the runs' own, else 4900)")
-    parser.add_argument("--consecutive", type=_count, help="episodes in a row (default: the runs' own, else 5)")
     parser.add_argument(
-        "--reference", default="A0", help="cell or group that the others are compared with (default: A0)"
+        "--threshold", type=_finite, metavar="RETURN", help="return to reach (default: the runs' own, else 4900)"
     )
-    parser.add_argument("--format", type=_formats, default=FORMATS, help="file formats of the figures: pdf,png,svg")
+    parser.add_argument(
+        "--consecutive", type=_count, metavar="N", help="episodes in a row (default: the runs' own, else 5)"
+    )
+    parser.add_argument(
+        "--reference",
+        default="A0",
+        metavar="CELL",
+        help="cell or group that the others are compared with (default: A0)",
+    )
+    parser.add_argument(
+        "--format", type=_formats, metavar="LIST", default=FORMATS, help="file formats of the figures: pdf,png,svg"
+    )
     parser.add_argument(
         "--window",
         type=_count,
+        metavar="N",
         help="episodes of the rolling average (default: the paper's 50; fewer for short runs)",
     )
     parser.add_argument("--no-stills", action="store_true", help="leave out figures 2 and 3, which need a GL library")
+    parser.add_argument(
+        "--if-changed", action="store_true", help="write nothing if runs and options are as the last time"
+    )
     parser.add_argument("--summary", action="store_true", help="only print the steps to threshold; write nothing")
     return parser
 

@@ -183,7 +183,7 @@ def _notes(name: str, runs: pd.DataFrame, planned: int) -> list[str]:
     if missed == n:
         notes.append(f"{name}: no run reached the threshold, so there is no mean and no t-test")
     elif missed:
-        notes.append(f"{name}: {missed} of {n} runs never reached the threshold; mean of the others, no t-test")
+        notes.append(f"{name}: {missed} of {n} runs never reached the threshold: mean of the others, no t-test")
     elif n == 1:
         notes.append(f"{name}: n = 1, no t-test")
     return notes

@@ -18,6 +18,8 @@ from analysis.style import Palette
 PAPER_WINDOW = 50
 #: Points of a curve.
 POINTS = 250
+#: Groups that are no cells shown as curves; more could not be told apart.
+MOST_OTHERS = 8
 #: Columns of the episodes that are drawn over the steps.
 QUANTITIES = ("episodic_return", "episode_length", VELOCITY_COLUMN)
 
@@ -80,6 +82,8 @@ class FigureSpec:
     title: str
     caption: str
     draw: Draw
+    #: Whether it leaves out groups that are no cells where there are more than ``MOST_OTHERS``.
+    limited: bool = False
 
 
 def drawn_runs(runs: pd.DataFrame, group: str) -> pd.DataFrame:

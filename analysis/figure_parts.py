@@ -13,11 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from acmr.records import CELLS
-from analysis.curves import POINTS, FigureData
+from analysis.curves import MOST_OTHERS, POINTS, FigureData
 from analysis.style import COLUMN, Palette
 
-#: Groups that are no cells shown as curves; more could not be told apart.
-MOST_OTHERS = 8
 #: Height of a row, inches.
 ROW = 0.24
 

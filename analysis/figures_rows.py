@@ -8,9 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from acmr.records import CELLS
-from analysis.curves import FigureData, FigureSpec
+from analysis.curves import MOST_OTHERS, FigureData, FigureSpec
 from analysis.figure_parts import (
-    MOST_OTHERS,
     ROW,
     count_label,
     mean_bar,
@@ -133,6 +132,6 @@ FIGURES = (
         "restricted means, where a run never reached the threshold.",
         differences,
     ),
-    FigureSpec("transfer_metrics", "Initial, mean and asymptotic return", _TRANSFER, transfer_metrics),
+    FigureSpec("transfer_metrics", "Initial, mean and asymptotic return", _TRANSFER, transfer_metrics, limited=True),
     FigureSpec("wall_clock", "Cost", "Wall-clock time of each run (dots) and the mean (bars).", wall_clock),
 )

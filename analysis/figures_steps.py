@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from acmr.records import CELLS, VELOCITY_COLUMN
-from analysis.curves import FigureData, FigureSpec, mean_curve
-from analysis.figure_parts import MOST_OTHERS, count_label, finish, marker_style, stacked, step_axis, two_lines
+from analysis.curves import MOST_OTHERS, FigureData, FigureSpec, mean_curve
+from analysis.figure_parts import count_label, finish, marker_style, stacked, step_axis, two_lines
 from analysis.style import COLUMN, Palette
 from analysis.survival import kaplan_meier
 
@@ -96,23 +96,27 @@ FIGURES = (
         "Kaplan-Meier estimate of the share of runs that have not reached the threshold; ticks: runs that were watched "
         "no longer.",
         kaplan_meier_curves,
+        limited=True,
     ),
     FigureSpec(
         "learning_curves",
         "Learning curves with bands",
         "Rolling averages over {window} episodes: mean over the seeds, and from the lowest to the highest seed.",
         learning_bands,
+        limited=True,
     ),
     FigureSpec(
         "episode_length",
         "Episode length",
         "Rolling averages over {window} episodes. Surviving an episode is most of what the threshold asks for.",
         episode_length,
+        limited=True,
     ),
     FigureSpec(
         "forward_velocity",
         "Forward velocity",
         "Rolling averages over {window} episodes. An agent that stands still has a velocity of zero.",
         forward_velocity,
+        limited=True,
     ),
 )

@@ -103,18 +103,29 @@ def run(options: argparse.Namespace) -> int:
         print("\n".join(said), file=sys.stderr)
         return 1
     analysis = analyze(data, options.threshold, options.consecutive, options.reference)
-    closing: list[str] = []
-    if not options.summary:
-        from analysis.results import write_results
-
-        out = options.out or Path("results") / options.runs.resolve().name
-        with tempfile.TemporaryDirectory() as scratch:
-            written = write_results(analysis, out, options, Path(scratch))
-        closing = [*written.left_out, *result_lines(out, written.tables, written.figures)]
+    closing = [] if options.summary else _write(analysis, options)
     title = f"Steps to threshold {analysis.threshold:g} ({analysis.consecutive} episodes in a row), {profile_of(data)}"
     print_summary(analysis.cells, analysis.comparisons, title)
     print("\n".join(["", *left_out_lines(analysis.measured), *lines, *closing]))
     return 0
+
+
+def _write(analysis: Analysis, options: argparse.Namespace) -> list[str]:
+    """Writes the results, unless they are there; what to say of them."""
+    from analysis.fingerprint import STAMP, fingerprint, is_current
+
+    out: Path = options.out or Path("results") / options.runs.resolve().name
+    asked = {key: value for key, value in vars(options).items() if key not in ("runs", "out", "if_changed")}
+    value = fingerprint(analysis.data, out, asked)
+    if options.if_changed and is_current(out, value):
+        return [f"results: {out}/ (nothing has changed since they were written)", f"report:  {out / 'report.html'}"]
+    from analysis.results import write_results
+
+    (out / STAMP).unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        written = write_results(analysis, out, options, Path(scratch))
+    (out / STAMP).write_text(value + "\n", encoding="utf-8")
+    return [*written.left_out, *result_lines(out, written.tables, written.figures)]
 
 
 def _common(data: RunSet, name: str, default: float) -> float:

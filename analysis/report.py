@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +15,7 @@ import pandas as pd
 from analysis.load import RunSet
 from analysis.missing import Missing
 from analysis.published import published_table3
-from analysis.tables import readable
+from analysis.tables import heading, readable
 
 #: Files of a run that are linked where they are there.
 RUN_FILES = ("episodes.csv", "episodes.csv.gz", "config.yaml", "summary.json", "run.log")
@@ -100,13 +99,14 @@ def write_report(report: Report, out: Path) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["words"] = _words
+    environment.filters["words"] = heading
     page = environment.get_template("report.html").render(
         report=report,
         table=_table,
         runs=_runs(report, out),
         source=published_table3()["source"].iloc[0],
         detailed=_detailed(report.table3),
+        notes=_notes,
     )
     path = out / "report.html"
     path.write_text(page, encoding="utf-8")
@@ -125,8 +125,13 @@ def _detailed(table3: pd.DataFrame) -> Table:
     text = readable(table3, missing="–")
     heads = [f"{index} − {reference}" for index, reference in zip(text["index"], text["reference"], strict=True)]
     names = [name for name in text.columns if name not in ("reference", "index", "note")]
-    rows = [[_words(name), *text[name]] for name in names]
+    rows = [[heading(name), *text[name]] for name in names]
     return Table(["", *heads], rows, [False] + [True] * len(heads))
+
+
+def _notes(comparisons: pd.DataFrame) -> list[str]:
+    """Each note once, though a cell has it in every comparison."""
+    return list(dict.fromkeys(note for row in comparisons["note"] for note in row.split("; ") if note))
 
 
 def _runs(report: Report, out: Path) -> list[dict[str, Any]]:
@@ -161,38 +166,3 @@ def _known(value: float) -> float | None:
 
 def _relative(path: Path, out: Path) -> str:
     return Path(os.path.relpath(path.resolve(), out.resolve())).as_posix()
-
-
-_WORDS = {
-    "std": "SD",
-    "t_score": "T-score",
-    "p_value": "P-value",
-    "p_holm": "P (Holm)",
-    "p_permutation": "P (permutation)",
-    "p_permutation_holm": "P (permutation, Holm)",
-    "p_log_rank": "P (log-rank, permutation)",
-    "p_log_rank_asymptotic": "P (log-rank, asymptotic)",
-    "p_restricted": "P (restricted means, permutation)",
-    "log_rank_z": "log-rank z",
-    "welch_t": "Welch's t",
-    "welch_df": "Welch's df",
-    "welch_p": "Welch's P",
-    "hedges_g": "Hedges' g",
-    "hedges_g_low": "g, 95% from",
-    "hedges_g_high": "g, 95% to",
-    "difference_low": "difference, 95% from",
-    "difference_high": "difference, 95% to",
-    "low": "95% from",
-    "high": "95% to",
-    "power_large_effect": "power for 0.8 SD",
-    "detectable_effect": "effect found in 80% (SD)",
-    "area_under_curve": "mean return (area)",
-}
-
-
-def _words(name: str) -> str:
-    """A column's name as it is read."""
-    if name in _WORDS:
-        return _WORDS[name]
-    text = re.sub(r"^std_", "SD ", re.sub(r"^n_", "n ", re.sub(r"^(t|p)_", lambda match: match[0].upper(), name)))
-    return text.replace("_", " ")

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from analysis import stills, words
-from analysis.curves import FigureData, default_window, learning_curves
-from analysis.figures import draw_all, picture, save
+from analysis import FORMATS, stills, words
+from analysis.curves import MOST_OTHERS, FigureData, default_window, learning_curves
+from analysis.figures import FIGURES, draw_all, picture, save
 from analysis.missing import matrix_command, profile_of
 from analysis.pipeline import Analysis
 from analysis.published import side_by_side
@@ -57,6 +57,7 @@ def write_results(analysis: Analysis, out: Path, options: argparse.Namespace, sc
         scratch: Folder for files that are not kept.
     """
     (out / "colorblind").mkdir(parents=True, exist_ok=True)
+    _clear(out)
     written = Written()
     # The pictures take seconds, in processes of their own: they are made while the rest is.
     rendering = [] if options.no_stills else stills.start(analysis.data.pair, scratch)
@@ -92,6 +93,18 @@ def write_results(analysis: Analysis, out: Path, options: argparse.Namespace, sc
         out,
     )
     return written
+
+
+def _clear(out: Path) -> None:
+    """Removes what an earlier analysis may have left and this one need not make again.
+
+    Figures 2 and 3 stay: a machine without a GL library shall not take them away.
+    """
+    names = [f"{spec.name}.{kind}" for spec in FIGURES for kind in FORMATS]
+    for path in [folder / name for folder in (out, out / "colorblind") for name in names]:
+        path.unlink(missing_ok=True)
+    for kind in ("csv", "md", "tex"):
+        (out / f"comparisons.{kind}").unlink(missing_ok=True)
 
 
 def _write_tables(analysis: Analysis, out: Path, written: Written) -> dict[str, pd.DataFrame]:
@@ -140,9 +153,10 @@ def _write_figures(analysis: Analysis, out: Path, options: argparse.Namespace, w
         folder = "" if palette.name == "paper" else palette.name
         svg = save(figure, out / folder, spec.name, options.format)
         files = [f"{spec.name}.{kind}" for kind in options.format]
-        entry = made.setdefault(
-            spec.name, Picture(spec.name, spec.title, spec.caption.format(window=window), {}, files)
-        )
+        caption = spec.caption.format(window=window)
+        if spec.limited and len(drawing.others) > MOST_OTHERS:
+            caption += f" Of the {len(drawing.others)} groups that are no cells the first {MOST_OTHERS} are drawn."
+        entry = made.setdefault(spec.name, Picture(spec.name, spec.title, caption, {}, files))
         entry.images[palette.name] = data_uri(svg, "svg+xml")
     written.figures += len(made)
     return list(made.values())

@@ -60,7 +60,9 @@ def finish(still: Still) -> tuple[np.ndarray | None, str]:
     if still.process.returncode == 0 and still.path.is_file():
         return plt.imread(still.path), ""
     lines = [line.strip() for line in said.splitlines() if line.strip()]
-    return None, lines[-1] if lines else f"rendering {still.env} ended with exit code {still.process.returncode}"
+    if not lines:
+        return None, f"rendering {still.env} ended with exit code {still.process.returncode}"
+    return None, lines[-1].removeprefix("error: ")
 
 
 def stop(stills: list[Still]) -> None:

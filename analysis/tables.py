@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,9 @@ from analysis.survival import restricted_mean
 CONFIGURATIONS = {"H0": "Baseline", "H1": "POC", "A0": "Baseline"} | {f"A{n}": f"Conf. {n}" for n in range(1, 5)}
 #: What a cell's transfer is measured against.
 BASELINES = {"H0": None, "H1": "H0", "A0": None}
+
+#: Columns beyond which a LaTeX table spans both columns of a paper.
+WIDE = 6
 
 _COUNTS = ("n_", "runs", "censored", "seed", "episodes", "reached")
 _STEPS = ("mean_", "std_", "difference", "restricted_", "steps", "low", "high", "horizon", "last_step", "mean", "std")
@@ -137,12 +141,14 @@ def write_table(table: pd.DataFrame, out: Path, name: str, caption: str, columns
     table.to_csv(out / f"{name}.csv", index=False, na_rep="NaN", lineterminator="\n")
     shown = readable(table if columns is None else table[columns])
     alignment = ["left" if name in _text_columns(table) else "right" for name in shown.columns]
+    shown.columns = pd.Index([heading(str(name)) for name in shown.columns])
     markdown = shown.to_markdown(index=False, disable_numparse=True, colalign=alignment)
     (out / f"{name}.md").write_text(markdown + "\n", encoding="utf-8")
     latex = shown.style.hide(axis="index").format(escape="latex").format_index(escape="latex", axis=1)
     text = latex.to_latex(
         hrules=True,
         caption=caption,
+        environment="table*" if len(shown.columns) > WIDE else "table",
         label=f"tab:{name}",
         position_float="centering",
         column_format="".join(side[0] for side in alignment),
@@ -177,3 +183,38 @@ def _cell_text(column: str, value: object, missing: str) -> str:
     if isinstance(value, int | np.integer) or column.startswith(_COUNTS) or column.startswith(_STEPS):
         return f"{value:,.0f}"
     return f"{value:.3f}"
+
+
+_WORDS = {
+    "std": "SD",
+    "t_score": "T-score",
+    "p_value": "P-value",
+    "p_holm": "P (Holm)",
+    "p_permutation": "P (permutation)",
+    "p_permutation_holm": "P (permutation, Holm)",
+    "p_log_rank": "P (log-rank, permutation)",
+    "p_log_rank_asymptotic": "P (log-rank, asymptotic)",
+    "p_restricted": "P (restricted means, permutation)",
+    "log_rank_z": "log-rank z",
+    "welch_t": "Welch's t",
+    "welch_df": "Welch's df",
+    "welch_p": "Welch's P",
+    "hedges_g": "Hedges' g",
+    "hedges_g_low": "g, 95% from",
+    "hedges_g_high": "g, 95% to",
+    "difference_low": "difference, 95% from",
+    "difference_high": "difference, 95% to",
+    "low": "95% from",
+    "high": "95% to",
+    "power_large_effect": "power for 0.8 SD",
+    "detectable_effect": "effect found in 80% (SD)",
+    "area_under_curve": "mean return (area)",
+}
+
+
+def heading(name: str) -> str:
+    """A column's name as it is read: T-score for t_score."""
+    if name in _WORDS:
+        return _WORDS[name]
+    text = re.sub(r"^std_", "SD ", re.sub(r"^n_", "n ", re.sub(r"^(t|p)_", lambda match: match[0].upper(), name)))
+    return text.replace("_", " ")

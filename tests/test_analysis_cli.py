@@ -12,8 +12,8 @@ import pytest
 from analysis_runs import rows_reaching, write_run
 
 from acmr.records import CELLS
-from analysis import stills
-from analysis.cli import FORMATS, main
+from analysis import FORMATS, stills
+from analysis.cli import main
 from analysis.figures import picture, save
 from analysis.load import load
 from analysis.settings import setting_differences
@@ -51,6 +51,29 @@ def test_figures_2_and_3_are_rendered_or_one_line_says_what_is_missing(tmp_path)
     assert nothing is None
     assert line
     assert "\n" not in line
+
+
+def test_results_are_not_made_again_if_nothing_has_changed(tmp_path, monkeypatch, capsys):
+    directory = write_run(tmp_path / "runs" / "paper", "A0", 1, rows_reaching(6000, 20_000), total=20_000)
+    monkeypatch.chdir(tmp_path)
+    line = ["runs/paper", "--no-stills", "--format", "svg", "--if-changed"]
+    report = tmp_path / "results" / "paper" / "report.html"
+    assert main(line) == 0
+    stale = report.with_name("comparisons.csv")
+    stale.write_text("of a group that is gone")
+    before = report.stat().st_mtime_ns
+    capsys.readouterr()
+    assert main(line) == 0
+    assert "nothing has changed" in capsys.readouterr().out
+    assert report.stat().st_mtime_ns == before
+    with (directory / "episodes.csv").open("a") as file:
+        file.write("20100,1.0,100,1.0,1.0,1.0\n")
+    assert main(line) == 0
+    assert "nothing has changed" not in capsys.readouterr().out
+    assert report.stat().st_mtime_ns > before
+    assert not stale.exists()
+    assert main([*line, "--threshold", "100"]) == 0
+    assert "nothing has changed" not in capsys.readouterr().out
 
 
 def test_the_summary_alone_writes_nothing(tmp_path):

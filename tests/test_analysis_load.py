@@ -148,9 +148,12 @@ def test_a_summary_that_counts_other_episodes_is_damage(root):
     assert "summary.json counts 3 episodes" in only(load(root))["reason"]
 
 
+CAUSE = {"step": 9050, "cause": "loss"}
+
+
 def test_a_run_that_diverged_did_not_reach_in_all_its_time(root):
     rows = rows_reaching(None, 9000)
-    write_run(root, "A0", 1, rows, total=20_000, summary={"status": "diverged", "step": 9050, "cause": "loss"})
+    write_run(root, "A0", 1, rows, total=20_000, summary={"status": "diverged", "global_step": 9050} | CAUSE)
     run = only(load(root))
     assert (run["state"], run["counted"], run["horizon"]) == ("diverged", True, 20_000)
     assert run["reason"] == "at step 9050: loss"

@@ -30,6 +30,7 @@ from analysis.survival import kaplan_meier, log_rank, log_rank_scores, restricte
 
 #: A busy machine is no failure.
 UNHURRIED = settings(deadline=None)
+FEWER = settings(deadline=None, max_examples=40)
 A, B = [412_000.0, 455_000.0, 503_000.0], [350_000.0, 361_000.0, 377_000.0]
 STEPS = st.lists(st.integers(1, 10**6).map(float), min_size=2, max_size=5)
 RUN = st.tuples(st.integers(1, 40).map(float), st.booleans())
@@ -62,7 +63,7 @@ def test_welch_by_hand():
     assert test.df == pytest.approx(sum(parts) ** 2 / sum(part**2 / 2 for part in parts), rel=1e-12)
 
 
-@UNHURRIED
+@FEWER
 @given(STEPS, STEPS)
 def test_turning_the_samples_round_turns_the_sign(first, second):
     assume(np.ptp(first) > 0 and np.ptp(second) > 0)
@@ -173,7 +174,7 @@ def test_the_interval_of_a_mean():
     assert stats.ttest_1samp(A, high).pvalue == pytest.approx(0.05)
 
 
-@UNHURRIED
+@FEWER
 @given(RUNS)
 def test_kaplan_meier_and_the_restricted_mean_agree_with_lifelines(runs):
     times, events = np.array([run[0] for run in runs]), np.array([run[1] for run in runs])
@@ -195,7 +196,7 @@ def test_the_restricted_mean_is_a_plain_mean_if_all_are_watched_to_the_horizon(r
     assert restricted_mean(times, events, 50.0) == pytest.approx(np.minimum(times, 50.0).mean())
 
 
-@UNHURRIED
+@FEWER
 @given(FEW_RUNS, FEW_RUNS)
 def test_the_log_rank_statistic_agrees_with_lifelines(first, second):
     (a, x), (b, y) = (map(np.array, zip(*runs, strict=True)) for runs in (first, second))

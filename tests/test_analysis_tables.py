@@ -220,7 +220,7 @@ def test_table_files(tmp_path):
     back = [float(line["t_score"]) for line in lines]
     assert back == pytest.approx(table["t_score"].tolist(), rel=0, abs=0, nan_ok=True)
     latex = (tmp_path / "table3.tex").read_text()
-    assert all(word in latex for word in (r"\toprule", r"\midrule", r"\bottomrule", r"t\_score"))
+    assert all(word in latex for word in (r"\toprule", r"\midrule", r"\bottomrule", "T-score", "A0 & A4 & 3 & 0"))
     assert len((tmp_path / "table3.md").read_text().splitlines()) == 2 + len(PAPER_ROWS)
 
 

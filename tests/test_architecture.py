@@ -37,11 +37,6 @@ def imports(path: Path) -> set[str]:
     return found
 
 
-def part_of(module: str) -> str:
-    """The learner is one part in several files."""
-    return "learner" if module.startswith("learner") else module
-
-
 def floor_of(name: str) -> int:
     floors = [index for index, members in enumerate(FLOORS) if name in members]
     assert floors, f"acmr/{name} stands on no floor of tests/test_architecture.py"
@@ -53,11 +48,11 @@ ACMR = [path for path in modules("acmr").values() if path.name != "__init__.py" 
 
 @pytest.mark.parametrize("path", ACMR, ids=lambda path: str(path.relative_to(ROOT)))
 def test_imports_go_down(path):
-    part = part_of(path.relative_to(ROOT / "acmr").parts[0].removesuffix(".py"))
+    part = path.relative_to(ROOT / "acmr").parts[0].removesuffix(".py")
     floor = floor_of(part)
     for module in imports(path):
         if module.startswith("acmr."):
-            other = part_of(module.split(".")[1])
+            other = module.split(".")[1]
             if other != part:
                 assert floor_of(other) < floor, f"{part} (floor {floor}) imports {other} (floor {floor_of(other)})"
 

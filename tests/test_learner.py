@@ -9,9 +9,10 @@ from torch import nn
 
 from acmr import matmul
 from acmr.config import SACConfig
-from acmr.learner_layers import CriticStack, Stack, columns
-from acmr.learner_parameters import Adam, FlatParameters
-from acmr.learner_policy import SquashedGaussian
+from acmr.learner import arrays
+from acmr.learner.layers import CriticStack, Stack, columns
+from acmr.learner.parameters import Adam, FlatParameters
+from acmr.learner.policy import SquashedGaussian
 from acmr.networks import Dimensions, Networks
 from acmr.replay_buffer import ReplayBuffer
 from acmr.sac import SAC
@@ -145,7 +146,9 @@ def test_layers_stay_the_truth_of_what_is_learned():
 
 
 @pytest.mark.parametrize("core", [None, CORE], ids=["plain", "adapted"])
-def test_acting_is_the_networks_sample(core):
+@pytest.mark.parametrize("devices", [{"cpu"}, set()], ids=["numpy", "torch"])
+def test_acting_is_the_networks_sample(core, devices, monkeypatch):
+    monkeypatch.setattr(arrays, "NUMPY_DEVICES", devices)
     agent = make_agent(core)
     draws = generator(1)
     for seed in range(20):

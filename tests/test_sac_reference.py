@@ -8,6 +8,7 @@ import torch
 from reference_sac import ReferenceSAC
 
 from acmr.config import SACConfig, TransferConfig
+from acmr.learner import arrays
 from acmr.matmul import use_fast_float32
 from acmr.networks import Dimensions, Networks
 from acmr.replay_buffer import Batch
@@ -118,7 +119,7 @@ def test_every_cell_takes_the_same_course(cell, teacher_factory):
 @pytest.mark.parametrize("sizes", [(40,), (24, 40, 16)])
 def test_any_number_of_layers(cell, sizes, teacher_factory):
     config = SACConfig(hidden_sizes=list(sizes), batch_size=33)
-    assert_same_course(lambda: make_networks(cell, sizes, teacher_factory), config)
+    assert_same_course(lambda: make_networks(cell, sizes, teacher_factory), config, updates=50)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +135,7 @@ def test_any_number_of_layers(cell, sizes, teacher_factory):
 )
 def test_any_settings(changes, teacher_factory):
     config = SACConfig(**({"hidden_sizes": [64, 48], "batch_size": 96} | changes))
-    assert_same_course(lambda: make_networks("A1", (64, 48), teacher_factory), config)
+    assert_same_course(lambda: make_networks("A1", (64, 48), teacher_factory), config, updates=50)
 
 
 def test_adapters_without_activation(teacher_factory):
@@ -142,14 +143,21 @@ def test_adapters_without_activation(teacher_factory):
     assert_same_course(lambda: make_networks("A4", (64, 48), teacher_factory, "none"), config)
 
 
+@pytest.mark.parametrize("cell", ["A0", "A2", "A3", "A4"])
+def test_the_code_path_of_a_gpu_takes_the_same_course(cell, teacher_factory, monkeypatch):
+    monkeypatch.setattr(arrays, "NUMPY_DEVICES", set())
+    config = SACConfig(hidden_sizes=[64, 48], batch_size=96)
+    assert_same_course(lambda: make_networks(cell, (64, 48), teacher_factory), config, updates=40)
+
+
 @pytest.mark.usefixtures("_double")
 @pytest.mark.parametrize("cell", CELLS)
 def test_every_cell_to_the_precision_of_float64(cell, teacher_factory):
     config = SACConfig(hidden_sizes=[64, 48], batch_size=96)
-    assert_same_course(lambda: make_networks(cell, (64, 48), teacher_factory), config)
+    assert_same_course(lambda: make_networks(cell, (64, 48), teacher_factory), config, updates=50)
 
 
 @pytest.mark.usefixtures("_double")
 def test_the_shape_of_the_paper_to_the_precision_of_float64():
     dims, high = Dimensions(376, 17), np.full(17, 0.4, np.float32)
-    assert_same_course(lambda: Networks(dims, (256, 256), -high, high, generator(5)), SACConfig(), updates=50)
+    assert_same_course(lambda: Networks(dims, (256, 256), -high, high, generator(5)), SACConfig(), updates=20)

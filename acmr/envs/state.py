@@ -78,11 +78,12 @@ def restore(env: Env, state: EnvState) -> None:
         if isinstance(value, bool | int | float):
             vars(bare)[name] = state.values["attributes"][name]
         elif _is_numeric(value):
-            vars(bare)[name] = state.arrays[f"attribute.{name}"].copy()
+            vars(bare)[name] = _like(value, state.arrays[f"attribute.{name}"]).copy()
     assert isinstance(bare, MujocoEnv)
     mujoco.mj_setState(bare.model, bare.data, state.arrays["integration"], _INTEGRATION)
     for name in data_arrays(bare.model):
-        getattr(bare.data, name)[...] = state.arrays[f"data.{name}"]
+        array = getattr(bare.data, name)
+        array[...] = _like(array, state.arrays[f"data.{name}"])
 
 
 def data_arrays(model: mujoco.MjModel) -> list[str]:
@@ -165,6 +166,12 @@ def _follows(
         return _play(second, actions, reset) == expected
     finally:
         second.close()
+
+
+def _like(array: np.ndarray, stored: np.ndarray) -> np.ndarray:
+    if (stored.shape, stored.dtype) != (array.shape, array.dtype):
+        raise ValueError(f"{stored.shape} {stored.dtype} stored, {array.shape} {array.dtype} expected")
+    return stored
 
 
 def _is_numeric(value: object) -> bool:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from acmr.learner_arrays import Array, array_of, math_of, tensor_of
-from acmr.learner_layers import Dense
+from acmr.learner.arrays import Array, array_of, math_of, tensor_of
+from acmr.learner.layers import Dense
 from acmr.networks import LOG_STD_MAX, LOG_STD_MIN
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from acmr.learner_arrays import Array, array_of, math_of
-from acmr.learner_parameters import Block
+from acmr.learner.arrays import Array, array_of, math_of
+from acmr.learner.parameters import Block
 
 _relu_backward = torch.ops.aten.threshold_backward.grad_input
 
@@ -40,7 +40,7 @@ class Place:
         self.inputs = columns(below.output, layer.networks) if below else empty
         self.input_gradient = columns(below.gradient, layer.networks) if below else empty
         self.inputs_transposed = self.inputs.transpose(1, 2)
-        #: Of a layer with one output, by network: inputs (batch, in), output and its gradient (batch,).
+        # Of a layer with one output, by network: inputs (batch, in), output and its gradient (batch,).
         self.vectors: list[tuple[Array, Array, Array]] = []
         if below and layer.fan_out == 1:
             self.vectors = [
@@ -130,7 +130,7 @@ class Scalar(Dense):
     def parameter_gradients(self, place: Place) -> None:
         """Writes the gradients of weight and bias."""
         for of_vector, (inputs, _, gradient) in zip(self._vector_gradients, place.vectors, strict=True):
-            self._math.matmul(gradient, inputs, out=of_vector)
+            self._math.matmul(inputs.T, gradient, out=of_vector)
         torch.sum(place.gradient, dim=1, keepdim=True, out=self._bias_gradient)
 
     def input_gradient(self, place: Place) -> None:
@@ -233,5 +233,5 @@ class CriticStack(Stack):
         (first, *others), (weight, *weights) = places[0].gradients, self._of_actions_transposed
         gradient = torch.mm(first, weight)
         for of_network, weight in zip(others, weights, strict=True):
-            gradient.addmm_(of_network, weight)
+            torch.addmm(gradient, of_network, weight, out=gradient)
         return gradient
