@@ -1,0 +1,61 @@
+"""The class that Hydra finds, for which it has to be defined under ``hydra_plugins``. See :mod:`sweeps.sweeper`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig
+
+
+class StagedSweeper(BasicSweeper):
+    """Hydra's own sweeper, with teachers before students and only what is missing.
+
+    Args:
+        max_batch_size: Not used; all runs are planned at once.
+        params: What is swept where the command line does not say so.
+        plan: Whether to print the plan and start nothing.
+        retries: How often a run that failed is tried again.
+        grace: Seconds that a training has to write its checkpoint when the sweep is stopped.
+    """
+
+    def __init__(
+        self,
+        max_batch_size: int | None,
+        params: dict[str, str] | None = None,
+        plan: bool = False,
+        retries: int = 2,
+        grace: float = 20.0,
+    ) -> None:
+        super().__init__(max_batch_size, params)
+        self.plan, self.retries, self.grace = plan, retries, grace
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """Keeps what the launcher will be made of, once the plan is there."""
+        self.hydra_context, self.config = hydra_context, config
+
+    def sweep(self, arguments: list[str]) -> Any:
+        """Expands the command line into runs and trains what is missing of them.
+
+        Raises:
+            SystemExit: Always, with the sweep's exit code.
+            ConfigError: If the sweep cannot be made; nothing has been started then.
+        """
+        # Here, because Hydra imports this file at the start of every single run.
+        from acmr.config import ConfigError
+        from sweeps.sweeper import Settings, run_sweep
+
+        assert self.hydra_context is not None
+        assert self.config is not None
+        parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
+        overrides = parser.parse_overrides([*self._parse_config(), *arguments])
+        for override in overrides:
+            if override.is_sweep_override() and not override.is_discrete_sweep():
+                raise ConfigError(
+                    f"{override.input_line}: has no end; sweep a list, as in {override.key_or_group}=1,2, or range(1,3)"
+                )
+        jobs = self.split_arguments(overrides, None)[0]
+        settings = Settings(plan_only=self.plan, retries=self.retries, grace=self.grace)
+        raise SystemExit(run_sweep(jobs, settings, self.config, self.hydra_context))

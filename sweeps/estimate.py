@@ -1,0 +1,123 @@
+"""What a sweep will need: time, disk and memory; measured where there are such runs, else worked out or left open."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from acmr.config import ExperimentConfig
+from acmr.envs import describe
+from sweeps.folder import COMPLETE
+from sweeps.plan import Plan, PlannedRun
+
+#: Memory of a training beside its replay buffer: Python, torch and MuJoCo (measured, 64-bit Linux, CPU).
+_BASE_MEMORY = 450e6
+#: Disk of a finished run where none of its kind is there to look at: results, networks and mirror, an upper limit.
+_RESULT_DISK = 20e6
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the missing runs need.
+
+    Attributes:
+        seconds: Time to the end of the last run; None: no finished run says how fast they are.
+        measured_on: How many finished runs the time comes from.
+        memory: Most memory at a time, in bytes; None: not known.
+        disk: Most disk at a time, in bytes; None: not known.
+        kept: Disk that stays, in bytes.
+    """
+
+    seconds: float | None
+    measured_on: int
+    memory: float | None
+    disk: float | None
+    kept: float
+
+
+def estimate(plan: Plan, output_dir: Path, workers: int) -> Estimate:
+    """Works out what the missing runs of a plan need when ``workers`` are trained at a time."""
+    speeds = _speeds(output_dir)
+    seconds = {run.index: _seconds(run, speeds) for run in plan.missing}
+    buffers = sorted((_buffer_bytes(run.spec.config) for run in plan.missing), key=lambda size: -(size or 0))
+    largest = buffers[:workers]
+    known = [size for size in largest if size is not None]
+    complete = len(known) == len(largest)
+    kept = sum(_kept_bytes(run) for run in plan.missing)
+    return Estimate(
+        seconds=_makespan(plan, {index: time for index, time in seconds.items() if time is not None}, workers)
+        if all(time is not None for time in seconds.values())
+        else None,
+        measured_on=sum(len(values) for values in speeds.values()),
+        memory=sum(known) + _BASE_MEMORY * len(largest) if complete else None,
+        disk=sum(known) * 1.1 + kept if complete else None,
+        kept=kept,
+    )
+
+
+def _speeds(output_dir: Path) -> dict[tuple[Any, ...], list[float]]:
+    """Steps per second of finished runs, by what makes runs equally fast; in part, too, for want of better."""
+    found: dict[tuple[Any, ...], list[float]] = {}
+    for path in output_dir.glob("*/*/seed_*/summary.json"):
+        try:
+            summary = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            continue
+        speed = summary.get("steps_per_second")
+        if summary.get("status") == COMPLETE and speed:
+            found.setdefault((path.parts[-4], path.parts[-3]), []).append(float(speed))
+    return found
+
+
+def _seconds(run: PlannedRun, speeds: dict[tuple[Any, ...], list[float]]) -> float | None:
+    config = run.spec.config
+    same = speeds.get((config.profile, run.spec.name))
+    alike = [speed for (profile, _), values in speeds.items() if profile == config.profile for speed in values]
+    values = same or alike
+    return config.total_timesteps / statistics.fmean(values) if values else None
+
+
+def _makespan(plan: Plan, seconds: dict[int, float], workers: int) -> float:
+    """Time to the end when each worker takes up the first run that can start (list scheduling)."""
+    ends = {run.index: 0.0 for run in plan.runs if run.ended}
+    free = [0.0] * workers
+    waiting = list(plan.order)
+    teachers = {run.index: run.teacher for run in plan.runs}
+    while waiting:
+        now = min(free)
+        ready = [index for index in waiting if _end_of(teachers[index], ends) <= now]
+        if not ready:
+            free[free.index(now)] = min(end for end in [*free, *ends.values()] if end > now)
+            continue
+        waiting.remove(ready[0])
+        free[free.index(now)] = ends[ready[0]] = now + seconds[ready[0]]
+    return max(ends.values(), default=0.0)
+
+
+def _end_of(teacher: int | None, ends: dict[int, float]) -> float:
+    return 0.0 if teacher is None else ends.get(teacher, float("inf"))
+
+
+def _buffer_bytes(config: ExperimentConfig) -> float | None:
+    """Most that the replay buffer can fill, as memory and in the checkpoints on disk."""
+    try:
+        about = describe(config.env)
+    except Exception:
+        # The plan is printed all the same; the run itself will say what is wrong with its environment.
+        return None
+    row = 4 * (len(about.observation_names) + len(about.action_names) + 3)
+    return float(row * min(config.agent.buffer_size, config.total_timesteps))
+
+
+def _kept_bytes(run: PlannedRun) -> float:
+    alike = [path.parent for path in run.spec.directory.parent.glob("seed_*/summary.json")]
+    sizes = [_size(folder.iterdir()) for folder in alike]
+    return statistics.fmean(sizes) if sizes else _RESULT_DISK
+
+
+def _size(files: Iterable[Path]) -> float:
+    return float(sum(file.stat().st_size for file in files if file.is_file()))

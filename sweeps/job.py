@@ -1,0 +1,145 @@
+"""The settings of one run as a file, and the process that trains it."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import IO
+
+from omegaconf import OmegaConf
+
+from acmr import compose
+from acmr.config import ExperimentConfig
+from acmr.identity import RunSpec
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+#: Environment variable with the process that a training must not outlive.
+PARENT = "ACMR_SWEEP_WORKER"
+#: Signals that end a sweep in good order; its processes inherit that they are blocked.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: Seconds that a training has for its checkpoint when its worker has gone.
+ORPHAN_GRACE = 20.0
+_POLL = 0.25
+_SET_DEATH_SIGNAL = 1
+
+
+def write_job(path: Path, spec: RunSpec) -> None:
+    """Stores a run with everything that follows from its settings, so that it needs no settings file any more."""
+    content = {"settings": spec.settings, "changes": spec.changes, "name": spec.name, "cell": spec.cell}
+    path.write_text(json.dumps(content) + "\n", encoding="utf-8")
+
+
+def read_job(path: Path) -> RunSpec:
+    """Reads what :func:`write_job` stored."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ExperimentConfig), content["settings"]))
+    assert isinstance(config, ExperimentConfig)
+    return RunSpec(config, content["changes"], content["name"], content["cell"])
+
+
+def adopt(path: Path) -> RunSpec:
+    """Makes this process the training of a job: with the settings of the sweep's start, and no longer than its worker.
+
+    Args:
+        path: A file of :func:`write_job`, within a sweep's folder.
+    """
+    _die_with_parent(int(os.environ.pop(PARENT, os.getppid())))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
+    # The student's teacher follows from these files, which nobody edits.
+    compose.CONFIG_FOLDER = path.parent.parent / "conf"
+    spec = read_job(path)
+    begun, planned = spec.directory / "config.yaml", path.parent.parent / "plan.json"
+    if begun.exists() and begun.stat().st_mtime_ns > planned.stat().st_mtime_ns:
+        # This sweep has begun it anew already; to be asked for once is to be done once.
+        spec = replace(spec, config=replace(spec.config, force=False))
+    return spec
+
+
+class Training:
+    """A run's own process.
+
+    Args:
+        job_file: The run's settings.
+        log_file: Takes what the process prints, at its end.
+        threads: Threads that it may use.
+    """
+
+    def __init__(self, job_file: Path, log_file: Path, threads: int) -> None:
+        log_file.parent.mkdir(parents=True, exist_ok=True)
+        self._log_file, self._start = log_file, log_file.stat().st_size if log_file.exists() else 0
+        variables = {f"{library}_NUM_THREADS": str(threads) for library in ("OMP", "MKL", "OPENBLAS")}
+        with log_file.open("ab") as log:
+            self._process = _start([sys.executable, str(REPOSITORY / "run.py"), f"@{job_file}"], variables, log)
+
+    def wait(self, seconds: float = _POLL) -> int | None:
+        """The exit code, negative for a signal; None if it still runs after ``seconds``."""
+        try:
+            return self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def stop(self, grace: float, hurry: Callable[[], bool] = lambda: False) -> int:
+        """Ends it: in good order, and by force if it has not ended after ``grace`` seconds, or once ``hurry()``."""
+        deadline = time.monotonic() + grace
+        self._process.terminate()
+        while (code := self.wait()) is None:
+            if time.monotonic() > deadline or hurry():
+                self._process.kill()
+        return code
+
+    def last_words(self) -> str:
+        """The line that says why it ended, if it printed one."""
+        with self._log_file.open("rb") as stream:
+            stream.seek(max(self._start, self._log_file.stat().st_size - 20_000))
+            lines = [line for line in stream.read().decode(errors="replace").splitlines() if line.strip()]
+        return _error_line(lines)
+
+
+def _start(command: list[str], variables: dict[str, str], log: IO[bytes]) -> subprocess.Popen[bytes]:
+    # Slurm announces the end of a job's time to all of its processes; only the worker is to act on it.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1, signal.SIGUSR2})
+    try:
+        return subprocess.Popen(
+            command,
+            env={**os.environ, **variables, PARENT: str(os.getpid())},
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            # Ctrl-C reaches the sweep alone; it ends its trainings one by one.
+            start_new_session=True,
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _error_line(lines: list[str]) -> str:
+    traces = [number for number, line in enumerate(lines) if line.startswith("Traceback (most recent call last)")]
+    if traces:
+        return next((line for line in lines[traces[-1] + 1 :] if not line.startswith(" ")), lines[-1])
+    return next((line.removeprefix("error: ") for line in reversed(lines) if line.startswith("error: ")), "")
+
+
+def _die_with_parent(parent: int) -> None:
+    """Ends this process soon after ``parent`` has, in good order if it can."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGTERM)
+    if os.getppid() != parent:
+        os._exit(128 + signal.SIGTERM)
+    threading.Thread(target=_watch, args=(parent,), name="parent-watch", daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(ORPHAN_GRACE)
+    os.kill(os.getpid(), signal.SIGKILL)

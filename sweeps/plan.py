@@ -1,0 +1,164 @@
+"""What a sweep has to do: settings in, runs and their order out. Nothing is started or written here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+from acmr.compose import compose_config, parse
+from acmr.config import ConfigError, ExperimentConfig
+from acmr.identity import RunSpec, differing_keys, specify, teacher_spec
+from acmr.messages import check_booleans
+from acmr.run_dir import RunDir
+from sweeps.folder import COMPLETE, DIVERGED
+
+#: Settings that a teacher takes over from its student because they change nothing in its result.
+_SHARED_KEYS = ("device", "threads", "progress", "log_every", "tracking", "checkpoint_every", "resume")
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a sweep.
+
+    Attributes:
+        index: Its place in the plan.
+        spec: The run.
+        ended: ``complete`` or ``diverged``, if it is there already.
+        teacher: Index of the run that has to be complete before this one starts.
+        implied: Whether it was not asked for, but is the teacher of a run that was.
+    """
+
+    index: int
+    spec: RunSpec
+    ended: str | None
+    teacher: int | None = None
+    implied: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All runs of a sweep, teachers before their students."""
+
+    runs: tuple[PlannedRun, ...]
+
+    @property
+    def missing(self) -> list[PlannedRun]:
+        """The runs that are not there yet."""
+        return [run for run in self.runs if run.ended is None]
+
+    @property
+    def stages(self) -> list[list[PlannedRun]]:
+        """The missing runs: those that can start at once, and those that wait for one of them."""
+        waits = {run.index for run in self.missing}
+        first = [run for run in self.missing if run.teacher not in waits]
+        second = [run for run in self.missing if run.teacher in waits]
+        return [stage for stage in (first, second) if stage]
+
+    @property
+    def order(self) -> list[int]:
+        """The missing runs as they are best taken up: those that others wait for first, then the longest."""
+        students = {run.index: 0 for run in self.runs}
+        for run in self.missing:
+            if run.teacher is not None:
+                students[run.teacher] += 1
+        return [
+            run.index for run in sorted(self.missing, key=lambda run: (-students[run.index], -effort(run), run.index))
+        ]
+
+
+def effort(run: PlannedRun) -> float:
+    """About how much work a run is, to compare runs: multiplications in the hidden layers."""
+    config = run.spec.config
+    sizes = config.agent.hidden_sizes
+    products = sum(a * b for a, b in pairwise(sizes)) + sizes[0]
+    return float(config.total_timesteps) * config.agent.batch_size * products
+
+
+def expand(jobs: Iterable[Sequence[str]]) -> list[RunSpec]:
+    """Makes a run of each job's overrides.
+
+    Raises:
+        ConfigError: If one of them cannot be run, or if two are the same run.
+    """
+    specs: dict[Path, tuple[RunSpec, Sequence[str]]] = {}
+    for overrides in jobs:
+        check_booleans(overrides)
+        spec = specify(parse(compose_config(overrides)))
+        if spec.directory in specs:
+            first, second = _difference(specs[spec.directory][1], overrides)
+            if first == second:
+                raise ConfigError(f"{first}: the same run twice; give every value once")
+            raise ConfigError(f"{first} and {second} are one run, {spec.directory}; sweep what tells them apart")
+        specs[spec.directory] = (spec, overrides)
+    return [spec for spec, _ in specs.values()]
+
+
+def make_plan(specs: Sequence[RunSpec]) -> Plan:
+    """Adds the teachers that students imply, and finds out what is there already.
+
+    Args:
+        specs: Runs in different directories.
+
+    Raises:
+        ConfigError: If a directory holds a run with other settings, or if a teacher that is named is not there.
+    """
+    listed = {spec.directory: spec for spec in specs}
+    ended = {directory: _ended(spec) for directory, spec in listed.items()}
+    students = [spec for spec in specs if ended[spec.directory] is None]
+    teacher_of = {spec.directory: teacher for spec in students if (teacher := _teacher(spec.config)) is not None}
+    added = {teacher.directory: teacher for teacher in teacher_of.values() if teacher.directory not in listed}
+    ended |= {directory: _ended(spec) for directory, spec in added.items()}
+    needed = {path: spec for path, spec in added.items() if ended[path] != COMPLETE}
+    teaching = {teacher.directory for teacher in teacher_of.values()}
+    all_runs = needed | {path: listed[path] for path in sorted(listed, key=lambda path: path not in teaching)}
+    index = {path: number for number, path in enumerate(all_runs)}
+    runs = []
+    for path, spec in all_runs.items():
+        teacher = teacher_of.get(path)
+        runs.append(
+            PlannedRun(
+                index=index[path],
+                spec=spec,
+                ended=ended[path],
+                teacher=index.get(teacher.directory) if teacher else None,
+                implied=path in needed,
+            )
+        )
+    return Plan(tuple(runs))
+
+
+def _teacher(config: ExperimentConfig) -> RunSpec | None:
+    if config.transfer.name == "none":
+        return None
+    if config.transfer.teacher is not None:
+        if not Path(config.transfer.teacher).exists():
+            raise ConfigError(
+                f"transfer.teacher={config.transfer.teacher}: there is no such file or run; train it first, "
+                "or leave transfer.teacher out and the sweep trains the teacher that belongs to each student"
+            )
+        return None
+    spec = teacher_spec(config)
+    return replace(spec, config=replace(spec.config, **{key: getattr(config, key) for key in _SHARED_KEYS}))
+
+
+def _ended(spec: RunSpec) -> str | None:
+    run_dir = RunDir(spec.directory)
+    stored = None if spec.config.force else run_dir.stored_settings()
+    if stored is None:
+        return None
+    differing = differing_keys(stored, spec.config)
+    if differing:
+        raise ConfigError(
+            f"{run_dir}: holds a run with other settings ({', '.join(differing)}); "
+            "type output_dir=FOLDER for another place, or force=true to replace it"
+        )
+    status = (run_dir.summary() or {}).get("status")
+    return str(status) if status in (COMPLETE, DIVERGED) else None
+
+
+def _difference(ours: Sequence[str], theirs: Sequence[str]) -> tuple[str, str]:
+    only_ours = [entry for entry in ours if entry not in theirs] or list(ours)
+    only_theirs = [entry for entry in theirs if entry not in ours] or list(theirs)
+    return " ".join(only_ours), " ".join(only_theirs)

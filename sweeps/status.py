@@ -1,0 +1,87 @@
+"""What every run is doing: ``python -m sweeps.status [OUTPUT_DIR]``. Exit code 1 if one has failed."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+
+from sweeps.folder import FAILED, FINAL, RUNNING, WAITING, Entry, State, SweepFolder, all_folders
+from sweeps.view import BLOCKED, LOST, RunView, counts, span, table, view_entries, view_run
+
+#: States for which somebody has to do something.
+_BAD = (FAILED, LOST, BLOCKED)
+
+
+def all_runs(output_dir: Path) -> list[RunView]:
+    """Every run below a folder, and those that its latest sweep has not begun yet."""
+    planned = _planned(output_dir)
+    found = {path.parent for name in ("config.yaml", "status.json") for path in output_dir.glob(f"*/*/seed_*/{name}")}
+    views = {view.directory: view for view in planned}
+    for directory in found - set(views):
+        views[directory] = view_run(directory, f"{directory.parts[-3]}/{directory.parts[-2]}", _seed(directory))
+    return sorted(views.values(), key=lambda view: (view.directory.parts[:-1], view.seed))
+
+
+def _planned(output_dir: Path) -> list[RunView]:
+    folders = all_folders(output_dir)
+    known: dict[Path, RunView] = {}
+    for folder in folders:
+        entries = folder.entries()
+        alive = folder.is_alive()
+        for view in view_entries(output_dir, entries, [_state(folder, entry, alive) for entry in entries]):
+            # What an older sweep never began is forgotten, what it saw fail is not.
+            if folder is folders[-1] or alive or view.state != WAITING:
+                known[view.directory] = _with_profile(view)
+    return list(known.values())
+
+
+def _state(folder: SweepFolder, entry: Entry, alive: bool) -> State:
+    state = folder.state(entry.index)
+    if state.state == RUNNING and not alive:
+        return State()
+    return state
+
+
+def _with_profile(view: RunView) -> RunView:
+    return replace(view, name=f"{view.directory.parts[-3]}/{view.directory.parts[-2]}")
+
+
+def _seed(directory: Path) -> int:
+    number = directory.name.removeprefix("seed_")
+    return int(number) if number.isdigit() else 0
+
+
+def _say(console: Console, line: str, color: str | None = None) -> None:
+    if console.is_terminal:
+        console.print(line, style=color, markup=False, soft_wrap=True)
+    else:
+        print(line)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Prints the table; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m sweeps.status", description=__doc__)
+    parser.add_argument("output_dir", nargs="?", type=Path, default=Path("runs"), help="folder of all runs (runs)")
+    output_dir = parser.parse_args(arguments).output_dir
+    if not output_dir.is_dir():
+        print(f"{output_dir}: no runs there yet; python run.py trains one")
+        return 0
+    views = all_runs(output_dir)
+    console = Console(highlight=False)
+    for line, color in table(views):
+        _say(console, line, color)
+    running = [view for view in views if view.state == RUNNING]
+    speed = sum(view.speed for view in running)
+    ahead = sum(view.total - view.step for view in views if view.state not in FINAL and view.state != BLOCKED)
+    eta = f"; {speed:,.0f} steps/s, {span(ahead / speed)} left" if speed else ""
+    _say(console, f"{len(views)} runs: {counts(views)}{eta}")
+    return 1 if any(view.state in _BAD for view in views) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,262 @@
+"""One sweep from its command line to its last run: plan, launch what is missing, look on, tell what became of it."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from hydra.types import HydraContext
+from omegaconf import DictConfig
+
+from acmr.compose import CONFIG_FOLDER
+from acmr.config import ConfigError
+from sweeps.board import Board, print_plan
+from sweeps.engine import Engine, make_engine
+from sweeps.estimate import estimate
+from sweeps.folder import COMPLETE, FAILED, FINAL, RUNNING, STOPPED, Entry, State, SweepFolder, all_folders
+from sweeps.job import STOP_SIGNALS, write_job
+from sweeps.launch import Launch
+from sweeps.plan import Plan, expand, make_plan
+
+#: Seconds between two looks at the jobs, and those beyond the trainings' own that workers have to end.
+_GLANCE, _MARGIN = 0.5, 10.0
+LOST_REASON = "its worker or its cluster job was killed"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The sweep's own settings, which are no run's.
+
+    Attributes:
+        plan_only: Whether to print the plan and start nothing.
+        retries: How often a run that failed is tried again.
+        grace: Seconds that a training has to write its checkpoint when the sweep is stopped.
+    """
+
+    plan_only: bool
+    retries: int
+    grace: float
+
+
+def run_sweep(jobs: Sequence[Sequence[str]], settings: Settings, config: DictConfig, context: HydraContext) -> int:
+    """Plans and trains.
+
+    Args:
+        jobs: Each run's overrides.
+        settings: The sweep's own settings.
+        config: Hydra's composed config.
+        context: Hydra's own.
+
+    Returns:
+        The exit code: 0 if every run has come to its end, 1 if not, 128 + the signal that stopped the sweep.
+
+    Raises:
+        ConfigError: If the sweep cannot be made; nothing has been started then.
+    """
+    _check(settings)
+    specs = expand(jobs)
+    plan, output_dir = make_plan(specs), Path(specs[0].config.output_dir)
+    engine = make_engine(config, context, max(run.spec.config.threads for run in plan.runs))
+    workers = max(1, min(engine.workers, len(plan.missing)))
+    if settings.plan_only:
+        print_plan(plan, estimate(plan, output_dir, workers), workers, output_dir)
+        return 0
+    if not plan.missing:
+        print(f"{len(plan.runs)} of {len(plan.runs)} runs complete: {_places(plan)}")
+        return 0
+    _refuse_overlap(plan, output_dir)
+    engine.clear(all_folders(output_dir))
+    return Sweep(plan, output_dir, settings, engine).run()
+
+
+class Sweep:
+    """The missing runs of a plan on their way.
+
+    Args:
+        plan: What there is to do.
+        output_dir: The folder of all runs.
+        settings: The sweep's own settings.
+        engine: What runs the jobs.
+    """
+
+    def __init__(self, plan: Plan, output_dir: Path, settings: Settings, engine: Engine) -> None:
+        self._plan, self._settings, self._engine = plan, settings, engine
+        header = {
+            # As it was typed, not as Hydra got it.
+            "command": shlex.join(["python", *sys.orig_argv[sys.orig_argv.index(sys.argv[0]) :]]),
+            "retries": settings.retries,
+            "grace": settings.grace,
+        }
+        self._entries = entries_of(plan, output_dir)
+        try:
+            self._folder = SweepFolder.create(output_dir, header, self._entries, plan.order, CONFIG_FOLDER)
+            for run in plan.missing:
+                write_job(self._folder.job_file(run.index), run.spec)
+        except OSError as error:
+            raise ConfigError(
+                f"output_dir={output_dir}: cannot be written ({error.strerror}); type output_dir=FOLDER"
+            ) from error
+        self._output_dir = output_dir
+        self._signal: int | None = None
+        self._abandoned = False
+
+    def run(self) -> int:
+        """Trains until nothing is left to do; returns the exit code."""
+        done = len(self._plan.runs) - len(self._plan.missing)
+        print(f"{len(self._plan.runs)} runs, {done} done, {len(self._plan.missing)} to train; {self._folder.path}")
+        # Who started this in the background may have chosen that some do not reach it.
+        wanted = [each for each in STOP_SIGNALS if signal.getsignal(each) is not signal.SIG_IGN]
+        before = {each: signal.signal(each, self._note) for each in wanted}
+        board = Board(self._folder, self._entries, self._output_dir)
+        try:
+            self._launch_all(board)
+        finally:
+            board.close()
+            for each, handler in before.items():
+                signal.signal(each, handler)
+        code = self._report(board)
+        if self._abandoned:
+            # A launcher that still waits for jobs holds nothing any more, and would not let this process end.
+            sys.stdout.flush()
+            os._exit(code)
+        return code
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        again, self._signal = self._signal is not None, number
+        # On a full disk the workers learn of it when this process has gone.
+        with suppress(OSError):
+            self._folder.stop(at_once=again)
+
+    def _launch_all(self, board: Board) -> None:
+        number = fruitless = 0
+        while self._signal is None and (runs := self._to_launch()):
+            before = [self._state(index) for index in runs]
+            launch = Launch(self._engine, self._folder, runs, number)
+            self._await(launch, board)
+            if self._signal is not None:
+                return
+            if launch.error is not None:
+                board.say(f"jobs were lost ({_line(launch.error)}); what they were training is taken up again")
+            self._settle()
+            number += 1
+            fruitless = fruitless + 1 if before == [self._state(index) for index in runs] else 0
+            if fruitless > self._settings.retries:
+                board.say(f"error: the launcher starts no jobs; {_line(launch.error)}")
+                return
+
+    def _await(self, launch: Launch, board: Board) -> None:
+        deadline, quiet = float("inf"), 0
+        while not launch.is_over(_GLANCE):
+            board.tick()
+            if self._signal is None:
+                continue
+            if deadline == float("inf"):
+                deadline = time.monotonic() + self._settings.grace + _MARGIN
+                board.say("stopping: the trainings write their checkpoints (once more to end them at once)")
+                launch.cancel()
+            # Hundreds of runs may still wait in the workers' queue; handing them out to nobody takes long.
+            quiet = quiet + 1 if self._engine.chooses and not self._is_training() else 0
+            if quiet > 2 or time.monotonic() > deadline:
+                break
+        self._abandoned = self._abandoned or launch.is_waiting
+
+    def _is_training(self) -> bool:
+        return any(self._folder.state(index).state == RUNNING for index in self._plan.order)
+
+    def _state(self, index: int) -> State:
+        ended = self._entries[index].ended
+        return State(ended) if ended else self._folder.state(index)
+
+    def _to_launch(self) -> list[int]:
+        """The runs that a launch may train, in order; without the students of teachers that failed."""
+        found = []
+        for index in self._plan.order:
+            teacher = self._entries[index].teacher
+            taught = COMPLETE if teacher is None else self._state(teacher).state
+            possible = taught == COMPLETE or (self._engine.chooses and taught not in FINAL)
+            if self._state(index).state not in FINAL and possible:
+                found.append(index)
+        return found
+
+    def _settle(self) -> None:
+        """After a launch nothing runs: a run that still says so was lost with its worker or its cluster job."""
+        for index in self._plan.order:
+            state = self._folder.state(index)
+            if state.state == RUNNING:
+                # On this machine one lost worker takes its siblings along, so that it is no fault of the run.
+                failures = state.failures + (0 if self._engine.chooses else 1)
+                lost = FAILED if failures > self._settings.retries else STOPPED
+                self._folder.set_state(index, State(lost, failures, LOST_REASON))
+
+    def _report(self, board: Board) -> int:
+        failed = board.closing_table()
+        complete = sum(view.state == COMPLETE for view in board.views)
+        print(f"{complete} of {len(board.views)} runs complete: {_places(self._plan)}")
+        if self._signal is not None:
+            print(f"stopped by {signal.Signals(self._signal).name}; to go on: {self._command()}", flush=True)
+            return 128 + self._signal
+        if failed:
+            print(f"to try again what failed: {self._command()}", flush=True)
+        return 1 if failed or any(view.state not in FINAL for view in board.views) else 0
+
+    def _command(self) -> str:
+        return str(self._folder.header()["command"])
+
+
+def entries_of(plan: Plan, output_dir: Path) -> list[Entry]:
+    """The runs of a plan as its sweep's folder keeps them."""
+    return [
+        Entry(
+            index=run.index,
+            name=run.spec.name,
+            cell=run.spec.cell,
+            seed=run.spec.config.seed,
+            directory=os.path.relpath(run.spec.directory, output_dir),
+            total_timesteps=run.spec.config.total_timesteps,
+            threads=run.spec.config.threads,
+            teacher=run.teacher,
+            ended=run.ended,
+        )
+        for run in plan.runs
+    ]
+
+
+def _check(settings: Settings) -> None:
+    # These come from a file and a command line that nobody has typed yet.
+    if not isinstance(settings.plan_only, bool):
+        raise ConfigError(f"plan={settings.plan_only}: must be true or false")
+    if type(settings.retries) is not int or settings.retries < 0:
+        raise ConfigError(f"retries={settings.retries}: an integer of at least 0 is needed")
+    if type(settings.grace) not in (int, float) or not 0 <= settings.grace < float("inf"):
+        raise ConfigError(f"hydra.sweeper.grace={settings.grace}: a number of seconds is needed")
+
+
+def _refuse_overlap(plan: Plan, output_dir: Path) -> None:
+    """Two sweeps on the same runs would only wait for one another."""
+    wanted = {entry.directory for entry in entries_of(plan, output_dir) if entry.ended is None}
+    for folder in all_folders(output_dir):
+        common = [entry for entry in folder.entries() if entry.directory in wanted and entry.ended is None]
+        if common and folder.is_alive():
+            process = folder.header()["process"]
+            raise ConfigError(
+                f"{output_dir / common[0].directory}: process {process} has it in its sweep; "
+                f"wait for that, or end it: kill {process}"
+            )
+
+
+def _line(error: BaseException | None) -> str:
+    text = str(error).strip().splitlines() if error is not None else []
+    return f"{type(error).__name__}: {text[0]}" if text else type(error).__name__
+
+
+def _places(plan: Plan) -> str:
+    places = {str(run.spec.directory.parent.parent): None for run in plan.runs}
+    return " ".join(places)

@@ -1,0 +1,191 @@
+"""How far runs are: read from their directories, shown as a table. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from acmr.heartbeat import read_status
+from sweeps.folder import COMPLETE, DIVERGED, FAILED, RUNNING, STOPPED, WAITING, Entry, State, is_alive
+
+#: A run that says it is running, but whose process is gone or has said nothing for so many seconds.
+LOST, SILENCE = "lost", 600.0
+BLOCKED = "blocked"
+_HEADER = ["run", "seed", "state", "step", "steps/s", "ETA", "return", ""]
+_LEFT = ("run", "state", "")
+_COLORS = {COMPLETE: "green", DIVERGED: "magenta", FAILED: "red", RUNNING: "cyan", LOST: "red", BLOCKED: "red"}
+
+
+@dataclass(frozen=True)
+class RunView:
+    """One run as it stands.
+
+    Attributes:
+        name: What it is called in tables.
+        seed: Its seed.
+        directory: Where it lies.
+        state: ``waiting``, ``running``, ``complete``, ``diverged``, ``failed``, ``stopped``, ``lost`` or ``blocked``.
+        step: Environment steps taken.
+        total: Those that it takes, 0 if not known.
+        speed: Steps per second: now, or over the whole of a complete run.
+        latest: Latest return; of a complete run the mean of its last ones.
+        reason: Why it is in this state, if there is something to say.
+    """
+
+    name: str
+    seed: int
+    directory: Path
+    state: str
+    step: int = 0
+    total: int = 0
+    speed: float = 0.0
+    latest: float | None = None
+    reason: str = ""
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Time to its end at the present speed."""
+        return (self.total - self.step) / self.speed if self.state == RUNNING and self.speed > 0 else None
+
+
+def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State | None = None) -> RunView:
+    """Looks at one run.
+
+    Args:
+        directory: Its directory, which need not be there yet.
+        name: What it is called.
+        seed: Its seed.
+        total: Steps that it takes, if that is known.
+        state: What the sweep that it belongs to knows of it.
+    """
+    summary = None if state and state.state == RUNNING else _summary(directory)
+    if summary is not None and summary.get("status") in (COMPLETE, DIVERGED):
+        step, speed = int(summary.get("global_step") or 0), float(summary.get("steps_per_second") or 0)
+        total = int(summary.get("total_timesteps") or total)
+        return RunView(name, seed, directory, summary["status"], step, total, speed, summary.get("final_return"))
+    status = read_status(directory) or {}
+    alive = status.get("state") == RUNNING and _is_alive(status)
+    told, reason = _told(status, state or State(STOPPED), alive)
+    return RunView(
+        name=name,
+        seed=seed,
+        directory=directory,
+        state=told,
+        step=int(status.get("global_step") or 0),
+        total=int(status.get("total_timesteps") or total),
+        speed=float(status.get("steps_per_second") or 0.0) if alive else 0.0,
+        latest=status.get("latest_return"),
+        reason=reason,
+    )
+
+
+def view_entries(
+    output_dir: Path, entries: Sequence[Entry], states: Sequence[State], known: Mapping[int, RunView] | None = None
+) -> list[RunView]:
+    """Looks at the runs of a sweep; a student whose teacher cannot become complete is ``blocked``.
+
+    Args:
+        output_dir: The folder of all runs.
+        entries: The runs, teachers before their students.
+        states: What the sweep knows of each.
+        known: Runs that need no second look, by index.
+    """
+    views: list[RunView] = []
+    for entry, told in zip(entries, states, strict=True):
+        if known and entry.index in known:
+            views.append(known[entry.index])
+            continue
+        name = f"{entry.cell}  {entry.name}" if entry.cell else entry.name
+        state = State(entry.ended) if entry.ended else told
+        view = view_run(output_dir / entry.directory, name, entry.seed, entry.total_timesteps, state)
+        teacher = views[entry.teacher] if entry.teacher is not None else None
+        if teacher is not None and view.state in (WAITING, STOPPED) and teacher.state in (FAILED, DIVERGED, BLOCKED):
+            reason = f"waits for its teacher {teacher.name} seed {teacher.seed}, which {_verb(teacher.state)}"
+            view = RunView(view.name, view.seed, view.directory, BLOCKED, total=view.total, reason=reason)
+        views.append(view)
+    return views
+
+
+def table(views: Iterable[RunView]) -> list[tuple[str, str | None]]:
+    """The runs, one a line below a header, each with its color."""
+    shown = list(views)
+    rows = [_HEADER, *(_cells(view) for view in shown)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADER))]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(width) if name in _LEFT else cell.rjust(width)
+            for cell, width, name in zip(row, widths, _HEADER, strict=True)
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return list(zip(lines, ["bold", *(_COLORS.get(view.state) for view in shown)], strict=True))
+
+
+def counts(views: Iterable[RunView]) -> str:
+    """How many runs are in which state."""
+    numbers: dict[str, int] = {}
+    for view in views:
+        numbers[view.state] = numbers.get(view.state, 0) + 1
+    order = (COMPLETE, DIVERGED, RUNNING, WAITING, STOPPED, LOST, BLOCKED, FAILED)
+    return ", ".join(f"{numbers[state]} {state}" for state in order if state in numbers) or "no runs"
+
+
+def span(seconds: float | None) -> str:
+    """A time to read: ``8 s``, ``12:05``, ``3:07:09``, ``2 d 3 h``."""
+    if seconds is None:
+        return "-"
+    whole = max(0, round(seconds))
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours >= 48:
+        return f"{hours // 24} d {hours % 24} h"
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def _cells(view: RunView) -> list[str]:
+    share = f" {100 * view.step / view.total:3.0f}%" if view.total else ""
+    return [
+        view.name,
+        str(view.seed),
+        view.state,
+        f"{view.step:,}{share}" if view.step else "-",
+        f"{view.speed:,.0f}" if view.speed else "-",
+        span(view.seconds_left),
+        f"{view.latest:,.0f}" if view.latest is not None else "-",
+        view.reason,
+    ]
+
+
+def _told(status: dict[str, Any], state: State, alive: bool) -> tuple[str, str]:
+    if state.state == RUNNING or (state.state == FAILED and not alive):
+        return state.state, state.reason
+    if alive:
+        return RUNNING, ""
+    if status.get("state") == RUNNING:
+        return LOST, "its process is gone; the command that started it goes on with it"
+    return (STOPPED if status else state.state), state.reason
+
+
+def _is_alive(status: dict[str, Any]) -> bool:
+    recent = time.time() - float(status.get("updated") or 0) < SILENCE
+    here = status.get("host") == os.uname().nodename
+    return recent and (not here or is_alive(int(status.get("process") or 0)))
+
+
+def _verb(state: str) -> str:
+    return {DIVERGED: "diverged", FAILED: "failed", BLOCKED: "cannot start"}[state]
+
+
+def _summary(directory: Path) -> dict[str, Any] | None:
+    try:
+        content = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None

@@ -1,0 +1,156 @@
+"""What a worker does: it takes up a run, trains it in a process of its own, and notes what has become of it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from acmr.config import ConfigError
+from acmr.run_dir import RunDir
+from sweeps.folder import COMPLETE, DIVERGED, FAILED, FINAL, RUNNING, STOPPED, Entry, State, SweepFolder
+from sweeps.job import STOP_SIGNALS, Training
+
+#: The run that a job takes up where it may choose.
+NEXT = "next"
+OUTPUT_FILE = "output.log"
+#: Exit codes of one training that mean something; see the manual of ``run.py``.
+REFUSED, NUMBERS_DIVERGED, HELD = 2, 3, 75
+#: Seconds to wait for a run's directory that another process holds; a killed one may still write its checkpoint.
+PATIENCE = 60.0
+_PAUSE = 0.5
+
+
+def work(cfg: DictConfig) -> None:
+    """Hydra's task: trains one run of a sweep, with its repetitions.
+
+    Args:
+        cfg: ``sweep``, the sweep's folder; ``run``, the index of the run or ``next``; ``parent``, the process that this
+            worker must not outlive, or 0.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    worker = Worker(SweepFolder(Path(cfg.sweep)), int(cfg.parent))
+    if cfg.run == NEXT:
+        worker.take_next()
+    else:
+        worker.take(int(cfg.run))
+    if worker.is_orphan():
+        # Its queue may hold more runs, and nobody is left to stop it.
+        os._exit(1)
+
+
+class Worker:
+    """Trains runs of a sweep.
+
+    Args:
+        folder: The sweep's folder.
+        parent: The process whose end is this one's too; 0: none.
+    """
+
+    def __init__(self, folder: SweepFolder, parent: int) -> None:
+        self._folder, self._parent = folder, parent
+        header = folder.header()
+        self._order: list[int] = header["order"]
+        self._entries = [Entry(**run) for run in header["runs"]]
+        self._retries, self._grace = int(header["retries"]), float(header["grace"])
+
+    def take_next(self) -> None:
+        """Takes up the first run that can start; waits while there is none but others may make one ready."""
+        while not self._is_over():
+            promising = False
+            for index in self._order:
+                if self._state(index).state in FINAL:
+                    continue
+                if not self._is_ready(index):
+                    promising = promising or self._may_become_ready(index)
+                    continue
+                with self._folder.claim(index) as mine:
+                    if mine and self._folder.state(index).state not in FINAL:
+                        return self._train(index)
+            if not promising:
+                return None
+            time.sleep(_PAUSE)
+        return None
+
+    def take(self, index: int) -> None:
+        """Takes up one run, unless it has ended."""
+        if self._state(index).state not in FINAL and not self._is_over():
+            self._train(index, bound=True)
+
+    def _state(self, index: int) -> State:
+        ended = self._entries[index].ended
+        return State(ended) if ended else self._folder.state(index)
+
+    def _is_ready(self, index: int) -> bool:
+        teacher = self._entries[index].teacher
+        return teacher is None or self._state(teacher).state == COMPLETE
+
+    def _may_become_ready(self, index: int) -> bool:
+        teacher = self._entries[index].teacher
+        return teacher is not None and self._state(teacher).state not in FINAL
+
+    def _is_over(self) -> bool:
+        return self._folder.stopping or self.is_orphan()
+
+    def is_orphan(self) -> bool:
+        """Whether the process that it works for has gone."""
+        return self._parent not in (0, os.getpid(), os.getppid())
+
+    def _train(self, index: int, bound: bool = False) -> None:
+        state, held_since = self._folder.state(index), time.monotonic()
+        while state.failures <= self._retries:
+            self._folder.set_state(index, replace(state, state=RUNNING))
+            code, words = self._attempt(self._entries[index])
+            outcome = self._outcome(index, code)
+            if outcome in (COMPLETE, DIVERGED, STOPPED):
+                self._folder.set_state(index, replace(state, state=outcome, reason=""))
+                return
+            if code == HELD and time.monotonic() - held_since < PATIENCE and not self._is_over():
+                time.sleep(_PAUSE)
+                continue
+            state = State(FAILED, state.failures + 1, _reason(code, words))
+            final = code in (REFUSED, HELD) or state.failures > self._retries
+            if not final:
+                again = f"attempt {state.failures + 1} of {self._retries + 1} after: {state.reason}"
+                state = replace(state, state=STOPPED, reason=again)
+            self._folder.set_state(index, state)
+            if final or (bound and code in _ENDED_FROM_OUTSIDE):
+                return
+
+    def _attempt(self, entry: Entry) -> tuple[int, str]:
+        run_dir = self._folder.output_dir / entry.directory
+        training = Training(self._folder.job_file(entry.index), run_dir / OUTPUT_FILE, entry.threads)
+        try:
+            while (code := training.wait()) is None and not self._is_over():
+                pass
+        finally:
+            # Also when Slurm takes this job's time away, which ends this function by an exception.
+            code = training.stop(self._grace, lambda: self._folder.killing)
+        return code, training.last_words()
+
+    def _outcome(self, index: int, code: int) -> str:
+        if code == 0 or code == NUMBERS_DIVERGED:
+            with suppress(ConfigError):
+                summary = RunDir(self._folder.output_dir / self._entries[index].directory).summary()
+                status = (summary or {}).get("status")
+                return str(status) if status in (COMPLETE, DIVERGED) else FAILED
+            return FAILED
+        return STOPPED if self._is_over() else FAILED
+
+
+_ENDED_FROM_OUTSIDE = (-signal.SIGTERM, 128 + signal.SIGTERM, 128 + signal.SIGINT)
+
+
+def _reason(code: int, words: str) -> str:
+    if code < 0:
+        name = signal.Signals(-code).name
+        hint = " (out of memory?)" if -code == signal.SIGKILL else ""
+        return f"killed by {name}{hint}"
+    if code in _ENDED_FROM_OUTSIDE:
+        return "ended from outside"
+    return words or f"exit code {code}"
