@@ -184,18 +184,19 @@ class Session:
         trainer.on_step, trainer.on_episode, trainer.on_metrics = after_step, recorder.episode, recorder.metrics
         summary: dict[str, Any] | None = None
         try:
-            try:
-                trainer.train()
-            except DivergedError as error:
-                summary = self._summary(checkpoints, state, error)
-            else:
-                summary = self._summary(checkpoints, state)
-                description = describe_teacher(spec, self.prepared.about, trainer.agent, summary)
+            state.start_clock()
+            made = self._summary(checkpoints, state, _train(trainer))
+            if made["status"] != DIVERGED:
+                description = describe_teacher(spec, self.prepared.about, trainer.agent, made)
                 save_teacher(run_dir.path, trainer.agent.networks, description)
             # Last: a run with a summary is finished.
-            run_dir.write_json(run_dir.summary_file, summary)
+            run_dir.write_json(run_dir.summary_file, made)
+            summary = made
         finally:
             recorder.close(summary)
+        if summary["physics_warnings"]:
+            counts = ", ".join(f"{count:,} x {kind}" for kind, count in summary["physics_warnings"].items())
+            self.say(f"{run_dir}: MuJoCo warned of the simulation: {counts}")
         if summary["status"] == DIVERGED:
             last = f"; the checkpoint of step {checkpoints.latest:,} is kept" if checkpoints.latest else ""
             self.say(f"{run_dir}: diverged at step {summary['step']:,}: {summary['cause']}{last}")
@@ -236,6 +237,15 @@ class Session:
             command=lambda: spec.command,
             mode=spec.config.resume,
         )
+
+
+def _train(trainer: Trainer) -> DivergedError | None:
+    """Trains to the end; returns what ended it before."""
+    try:
+        trainer.train()
+    except DivergedError as error:
+        return error
+    return None
 
 
 def _tracker(spec: RunSpec, say: Callable[[str], None]) -> Tracker:

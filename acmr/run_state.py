@@ -49,6 +49,10 @@ class RunState:
         """How long the run has taken so far."""
         return self.seconds_before + time.perf_counter() - self._started
 
+    def start_clock(self) -> None:
+        """Counts the seconds of this process from now on."""
+        self._started = time.perf_counter()
+
     def capture(self) -> Snapshot:
         """Copies the state, and waits until the files that belong to it are on the disk."""
         trainer = self.trainer

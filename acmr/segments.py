@@ -56,7 +56,7 @@ class BufferFiles:
         oldest = buffer.added - len(buffer)
         first = max(self._segments[-1].end if self._segments else 0, oldest)
         if first < buffer.added:
-            data = save_arrays(_transitions(buffer, np.arange(first, buffer.added)))
+            data = save_arrays(_transitions(buffer, first, buffer.added))
             segment = Segment(first, buffer.added, Mark.of(data))
             write_bytes(self._folder / segment.name, data)
             self._segments.append(segment)
@@ -126,13 +126,15 @@ def _bytes_per_transition(buffer: ReplayBuffer) -> int:
     return 4 * (buffer.rows.shape[1] + buffer.observation_dim + 2) + 1
 
 
-def _transitions(buffer: ReplayBuffer, numbers: np.ndarray) -> dict[str, np.ndarray]:
-    rows = numbers % len(buffer.rows)
-    endings = buffer.endings[rows]
+def _transitions(buffer: ReplayBuffer, first: int, end: int) -> dict[str, np.ndarray]:
+    rows = np.arange(first, end) % len(buffer.rows)
+    # A slice is not copied; only where the ring begins anew must the rows be gathered.
+    where = slice(rows[0], rows[-1] + 1) if rows[0] <= rows[-1] else rows
+    endings = buffer.endings[where]
     return {
-        "rows": buffer.rows[rows],
-        "rewards": buffer.rewards[rows],
-        "terminated": buffer.terminated[rows],
+        "rows": buffer.rows[where],
+        "rewards": buffer.rewards[where],
+        "terminated": buffer.terminated[where],
         "ended": (endings >= 0).astype(np.uint8),
         "last_observations": buffer.last_observations[endings[endings >= 0]],
     }

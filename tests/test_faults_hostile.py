@@ -1,0 +1,222 @@
+"""Files from somebody else: whatever they hold, they run nothing, fill nothing and reach nothing outside the run."""
+
+import hashlib
+import json
+import os
+import resource
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from safetensors.numpy import save as save_arrays
+from torture import ANT, Run, at_step
+
+from acmr.checkpoint import load_teacher
+from acmr.config import ConfigError
+from acmr.networks import Dimensions
+from acmr.run_dir import RunDir
+from acmr.snapshots import Snapshot, SnapshotStore
+
+DIMS, WIDTHS = Dimensions(5, 2), (8, 8)
+
+
+@pytest.fixture
+def teacher(teacher_factory) -> Path:
+    return teacher_factory(DIMS, WIDTHS).path.parent
+
+
+def edit(folder: Path, **entries: object) -> None:
+    """Changes a teacher's description as somebody would who knows what they do."""
+    path = folder / "teacher.json"
+    content = json.loads(path.read_text()) | entries
+    rest = {name: value for name, value in content.items() if name != "description_sha256"}
+    content["description_sha256"] = hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+    path.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {"hidden_sizes": [1_000_000, 1_000_000]},
+        {"hidden_sizes": [10**18]},
+        {"hidden_sizes": [8, -8]},
+        {"hidden_sizes": []},
+        {"hidden_sizes": "88"},
+        {"hidden_sizes": [8.0, 8.0]},
+        {"hidden_sizes": [True, True]},
+        {"core": [1_000_000, 1_000_000]},
+        {"core": [3]},
+        {"observation_names": ["a"] * 50_000},
+        {"observation_names": [["a"]] * 5},
+        {"observation_names": {"a": 1}},
+        {"action_low": [float("nan")] * 2},
+        {"action_low": [-1.0]},
+        {"log_alpha": float("inf")},
+        {"log_alpha": "0"},
+        {"adapter_activation": "__import__('os').system"},
+        {"config": "rm"},
+        {"seed": "1"},
+        {"format_version": 2},
+        {"sha256": 7},
+    ],
+    ids=str,
+)
+def test_a_wrong_description_is_refused_before_anything_is_made_of_it(entries, teacher):
+    edit(teacher, **entries)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ConfigError) as caught:
+        load_teacher(teacher)
+    assert "\n" not in str(caught.value)
+    assert str(teacher) in str(caught.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kilobytes
+
+
+def test_every_flip_in_a_teacher_is_noticed(teacher):
+    rng = np.random.default_rng(0)
+    for name in ("teacher.json", "teacher.safetensors"):
+        path = teacher / name
+        data = path.read_bytes()
+        for place in rng.integers(len(data) * 8, size=150):
+            flipped = bytearray(data)
+            flipped[place // 8] ^= 1 << int(place % 8)
+            path.write_bytes(flipped)
+            try:
+                load_teacher(teacher)
+            except ConfigError:
+                continue
+            # White space between the entries means nothing.
+            assert json.loads(flipped) == json.loads(data)
+        path.write_bytes(data)
+    load_teacher(teacher)
+
+
+def test_a_pickle_is_never_loaded(teacher, tmp_path):
+    import pickle
+
+    class Bomb:
+        def __reduce__(self):
+            return (os.mkdir, (str(tmp_path / "exploded"),))
+
+    for data in (pickle.dumps(Bomb()), b"\x08\x00\x00\x00\x00\x00\x00\x00" + pickle.dumps(Bomb())):
+        (teacher / "teacher.safetensors").write_bytes(data)
+        edit(teacher, sha256=hashlib.sha256(data).hexdigest())
+        with pytest.raises(ConfigError, match="not a safetensors file"):
+            load_teacher(teacher)
+    assert not (tmp_path / "exploded").exists()
+
+
+def test_enormous_and_endless_files_are_not_read(teacher):
+    with (teacher / "teacher.safetensors").open("r+b") as stream:
+        stream.truncate(1 << 40)
+    with pytest.raises(ConfigError, match="1099511627776 bytes"):
+        load_teacher(teacher)
+    (teacher / "teacher.json").unlink()
+    os.mkfifo(teacher / "teacher.json")
+    with pytest.raises(ConfigError, match="missing beside it"):
+        load_teacher(teacher)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a: &a [x]\nb: [*a, *a]",
+        "!!python/object/apply:os.system ['touch exploded']",
+        "a: " + "[" * 20_000,
+        "\x00\xff",
+        "seed: " + "1" * 2_000_000,
+    ],
+    ids=["aliases", "object", "deep", "binary", "large"],
+)
+def test_a_hostile_settings_file(text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.yaml").write_text(text, encoding="latin-1")
+    with pytest.raises(ConfigError, match="not readable; type force=true"):
+        RunDir(tmp_path).stored_settings()
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
+
+
+def test_settings_that_a_run_stores_can_be_read_again(tmp_path):
+    run = Run(tmp_path, ANT)
+    run.folder.mkdir(parents=True)
+    RunDir(run.folder).start(run.spec.settings)
+    assert RunDir(run.folder).stored_settings() == yaml.safe_load(yaml.safe_dump(run.spec.settings))
+
+
+@pytest.fixture
+def stopped(tmp_path) -> Run:
+    run = Run(tmp_path / "run", ANT)
+    assert run(at_step(90)).code == -signal.SIGKILL
+    assert run.checkpoints == [40, 80]
+    SnapshotStore(run.folder / "checkpoint", 0).discard(40)
+    return run
+
+
+@pytest.mark.parametrize(
+    "name", ["../../outside", "/etc/hostname", "segment_0_40.safetensors/../x", "step_80.json\x00", ".", "x" * 5000]
+)
+def test_a_checkpoint_that_names_other_files_is_refused(name, stopped):
+    store = SnapshotStore(stopped.folder / "checkpoint", 1 << 30)
+    snapshot = store.read(80)
+    store.write(80, Snapshot(snapshot.values, snapshot.arrays, {name: next(iter(snapshot.files.values()))}))
+    ended = stopped()
+    assert ended.code == 2
+    assert "not a checkpoint of this run" in ended.said
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("added", 10**18), ("added", -1), ("added", "1"), ("ended", 10**9), ("global_step", "x"), ("global_step", None),
+        ("episode", []), ("environment", {"random": {"bit_generator": "MT19937"}}), ("learner", {}),
+        ("logs", {"episodes": [10**15, "0"]}), ("replay", {"bit_generator": "PCG64", "state": {"state": -1, "inc": 0}}),
+    ],
+)  # fmt: skip
+def test_a_checkpoint_with_impossible_values_is_refused(path, value, stopped):
+    store = SnapshotStore(stopped.folder / "checkpoint", 1 << 30)
+    snapshot = store.read(80)
+    snapshot.values["state"][path] = value
+    store.write(80, snapshot)
+    ended = stopped()
+    assert ended.code == 2, ended.said
+    assert "no checkpoint can be used" in ended.said
+
+
+def test_arrays_that_do_not_fit_are_refused(stopped):
+    store = SnapshotStore(stopped.folder / "checkpoint", 1 << 30)
+    snapshot = store.read(80)
+    for name in ("agent/actor", "observation", "environment/data.xipos"):
+        arrays = snapshot.arrays | {name: np.zeros(3)}
+        store.write(80, Snapshot(snapshot.values, arrays, snapshot.files))
+        assert stopped().code == 2, name
+
+
+def test_a_segment_larger_than_the_buffer_is_not_read(stopped):
+    from acmr.durable import Mark
+
+    folder = stopped.folder / "checkpoint"
+    path = folder / "segment_0_40.safetensors"
+    path.write_bytes(save_arrays({"rows": np.zeros((10_000, 35), np.float32)}))
+    store = SnapshotStore(folder, 1 << 30)
+    snapshot = store.read(80)
+    files = {**snapshot.files, path.name: Mark.of(path.read_bytes())}
+    store.write(80, Snapshot(snapshot.values, snapshot.arrays, files))
+    assert "larger than this run's replay buffer" in stopped().said
+
+
+@pytest.mark.parametrize("name", ["checkpoint", "episodes.csv", "run.log", ".lock", ".status.json.tmp"])
+def test_links_in_a_run_directory_lead_nowhere(name, stopped, tmp_path):
+    outside = tmp_path / "outside"
+    place = stopped.folder / name
+    if place.exists():
+        place.rename(outside)
+    else:
+        outside.write_bytes(b"theirs")
+    files = [outside] if outside.is_file() else sorted(outside.iterdir())
+    before = [path.read_bytes() for path in files]
+    place.symlink_to(outside)
+    ended = stopped()
+    assert ended.code == (0 if name == ".status.json.tmp" else 2), ended.said
+    assert "Traceback" not in ended.said
+    assert [path.read_bytes() for path in files] == before
