@@ -81,6 +81,9 @@ def outcome(folder: Path, step: int, overrides: tuple[str, ...], path: str | Non
     shutil.copytree(folder / f"at_{step}", work)
     run = Run(work, overrides)
     store = SnapshotStore(run.folder / "checkpoint", 1 << 30)
+    for earlier in store.steps()[1:]:
+        # Nothing to fall back to.
+        store.discard(earlier)
     if path is not None:
         snapshot = store.read(step)
         arrays = dict(snapshot.arrays)

@@ -1,28 +1,20 @@
-"""Kills at random moments, at each durable write, and again in the recovery. ``ACMR_TORTURE=n``: n times as many."""
+"""Kills and signals at random moments, and twenty starts at once. ``ACMR_TORTURE=n``: n times as many."""
 
 import os
 import random
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from torture import ANT, HUMANOID, SMALL, Run, at_step, at_write, count_writes, same
+from torture import ANT, HUMANOID, SMALL, Run, at_step, same
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parent.parent
 ROUNDS = int(os.environ.get("ACMR_TORTURE", "1"))
 KINDS = {"humanoid": HUMANOID, "ant": ANT}
-#: As few durable writes as show every kind of them.
-SHORT = (
-    *(word for word in ANT if not word.startswith(("total_timesteps", "env.max_episode_steps", "agent.learning"))),
-    "total_timesteps=90", "env.max_episode_steps=25", "agent.learning_starts=50",
-)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -81,34 +73,6 @@ def test_random_signals(kind, untouched, tmp_path):
     same(run.finish(), wanted)
 
 
-def test_a_kill_at_each_durable_write_and_again_in_the_recovery(untouched, tmp_path):
-    count, run, rng = tmp_path / "writes", Run(tmp_path / "run", SHORT), random.Random(0)
-    assert run(count_writes(count)).code == 0
-    names = count.read_text().splitlines()
-    assert {"rename step_40.json", "remove segment_0_40.safetensors", "rename summary.json"} <= set(names)
-    for number in range(1, len(names) + 1):
-        shutil.rmtree(run.folder)
-        assert run(at_write(number)).code == -signal.SIGKILL
-        for _ in range(ROUNDS):
-            again = rng.randint(1, len(names))
-            assert run(at_write(again)).code in (0, -signal.SIGKILL), (names[number - 1], names[again - 1])
-        same(run.finish(), untouched(SHORT)[0])
-
-
-def test_a_kill_at_each_durable_write_of_a_recovery(untouched, tmp_path):
-    stopped, work = Run(tmp_path / "stopped", SHORT), Run(tmp_path / "work", SHORT)
-    assert stopped(at_step(85)).code == -signal.SIGKILL
-    count = tmp_path / "writes"
-    shutil.copytree(stopped.output, work.output)
-    assert work(count_writes(count)).code == 0
-    for number in range(1, len(count.read_text().splitlines()) + 1):
-        shutil.rmtree(work.output)
-        shutil.copytree(stopped.output, work.output)
-        assert work(at_write(number)).code == -signal.SIGKILL
-        # The settings say where the run was first put.
-        same(work.finish() | {"config.yaml": b""}, untouched(SHORT)[0] | {"config.yaml": b""})
-
-
 def test_around_step_1000_of_an_episode(untouched, tmp_path):
     overrides = (
         "env=gym", "env.id=HalfCheetah-v5", "total_timesteps=1100", *SMALL,
@@ -150,57 +114,3 @@ def test_twenty_starts_at_once(untouched, tmp_path):
         for end in held:
             assert re.search(rf"held by process {winner} on \S+ since \d{{4}}-\d\d-\d\d", end.said), end.said
         same(run.outcome(), untouched(overrides)[0])
-
-
-MATRIX = (
-    "matrix=quick", "tracking=off", "progress=off", "total_timesteps=900", "agent.hidden_sizes=[16,16]",
-    "agent.batch_size=32", "agent.learning_starts=200", "checkpoint_every=100",
-)  # fmt: skip
-
-
-def test_a_matrix_whose_trainings_and_then_whose_parent_are_killed(tmp_path):
-    undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"
-    assert sweep(undisturbed).wait(600) == 0
-    rng, parent = random.Random(0), sweep(disturbed)
-    for _ in range(5):
-        victim = None
-        while victim is None:
-            assert parent.poll() is None
-            time.sleep(rng.uniform(0.2, 0.6))
-            victim = next(iter(rng.sample(found := learning(disturbed), len(found))), None)
-        os.kill(victim, signal.SIGKILL)
-    time.sleep(rng.uniform(0.5, 3.0))
-    parent.kill()
-    parent.wait()
-    assert sweep(disturbed).wait(600) == 0
-    folders = sorted(path.parent for path in undisturbed.glob("quick/*/seed_*/summary.json"))
-    assert len(folders) == 21
-    for folder in folders:
-        same(left(disturbed / folder.relative_to(undisturbed), disturbed), left(folder, undisturbed))
-
-
-def sweep(out: Path) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        [sys.executable, str(ROOT / "run.py"), *MATRIX, f"output_dir={out}"],
-        cwd=out.parent, stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT, start_new_session=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-
-
-def learning(out: Path) -> list[int]:
-    """Processes that train a run of a sweep and have made a checkpoint."""
-    holders = []
-    for folder in {path.parent.parent for path in out.glob("quick/*/seed_*/checkpoint/step_*.json")}:
-        match = re.match(r"process (\d+) ", (folder / ".lock").read_text())
-        if match and f"@{out}".encode() in Path(f"/proc/{match[1]}/cmdline").read_bytes():
-            holders.append(int(match[1]))
-    return sorted(holders)
-
-
-def left(folder: Path, out: Path) -> dict[str, bytes]:
-    """What a run of a sweep left, as :meth:`torture.Run.outcome` has it."""
-    (out / "buffer.sha256").write_bytes(b"")
-    run = Run.__new__(Run)
-    run.output = out
-    run.spec = type("Spec", (), {"directory": folder})()
-    return {name: data for name, data in run.outcome().items() if name != "output.log"}

@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 TINY = ("profile=quick", "tracking=off", "progress=off", "total_timesteps=300")
 #: Long enough to be found and killed in the middle.
-SHORT = ("profile=quick", "tracking=off", "progress=off", "total_timesteps=4000")
+SHORT = ("profile=quick", "tracking=off", "progress=off", "total_timesteps=3000")
 FOUR = ("experiment=H0,A1", "seed=1,2")
 BROKEN_ENVIRONMENTS = """
 import os

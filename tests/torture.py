@@ -43,6 +43,11 @@ SMALL = (
 )  # fmt: skip
 HUMANOID = ("env=humanoid", "total_timesteps=300", *SMALL)
 ANT = ("env=ant", "total_timesteps=300", "env.max_episode_steps=90", *SMALL)
+#: As few durable writes as show every kind of them: two checkpoints, episodes, metrics, the end.
+SHORT = (
+    *(word for word in ANT if not word.startswith(("total_timesteps", "env.max_episode_steps", "agent.learning"))),
+    "total_timesteps=90", "env.max_episode_steps=25", "agent.learning_starts=50",
+)  # fmt: skip
 #: Entries of summary.json that say how long it took.
 TIMES = ("wall_seconds", "steps_per_second")
 #: Files that say how a run went, not what came of it.
