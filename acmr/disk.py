@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 from acmr.config import ConfigError, ExperimentConfig
@@ -38,13 +39,22 @@ def check_space(config: ExperimentConfig, networks: Networks, run_dir: Path, che
     """
     place = next((folder for folder in (run_dir, *run_dir.absolute().parents) if folder.is_dir()), Path("/"))
     needed = space_needed(config, networks)
-    held = sum(path.lstat().st_size for path in checkpoint_folder.iterdir()) if checkpoint_folder.is_dir() else 0
     free = shutil.disk_usage(place).free
-    if needed > free + held:
+    if needed > free + _held(checkpoint_folder):
         raise ConfigError(
             f"{run_dir}: takes up to {_size(needed)} while it runs, but its disk has {_size(free)} free; free some, "
             "type output_dir=FOLDER on another disk, or checkpoint_every=0 (it cannot be resumed then)"
         )
+
+
+def _held(folder: Path) -> int:
+    total = 0
+    # Another process may be at work there, and remove what is looked at.
+    with suppress(FileNotFoundError, NotADirectoryError):
+        for path in folder.iterdir():
+            with suppress(FileNotFoundError):
+                total += path.lstat().st_size
+    return total
 
 
 def _size(count: int) -> str:

@@ -117,8 +117,9 @@ class BufferFiles:
 
 
 def replay_bytes(capacity: int, steps: int, observation_dim: int, action_dim: int) -> int:
-    """Bytes on disk of the replay buffer of a run of so many steps, the ends of its episodes apart."""
-    return min(capacity, steps) * (4 * (observation_dim + action_dim + 2) + 1)
+    """Bytes on disk of the replay buffer of a run of so many steps, with episodes of 20 steps and more."""
+    transition = 4 * (observation_dim + action_dim + 2) + 1
+    return int(min(capacity, steps) * (transition + 4 * observation_dim / 20))
 
 
 def _bytes_per_transition(buffer: ReplayBuffer) -> int:
