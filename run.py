@@ -31,8 +31,14 @@ register_schema()
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def train(cfg: DictConfig) -> None:
     """Runs what the command line describes; sweeps.sweeper does so where that is more than one run."""
-    check_booleans(HydraConfig.get().overrides.task)
-    _run(specify(parse(cfg)))
+
+    def start() -> None:
+        check_booleans(HydraConfig.get().overrides.task)
+        _run(specify(parse(cfg)))
+
+    # An error that left from here would get a line of Hydra's own before it.
+    if code := _exit_code(start):
+        sys.exit(code)
 
 
 def _run(spec: RunSpec) -> None:

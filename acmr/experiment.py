@@ -58,8 +58,8 @@ def run_experiment(spec: RunSpec, say: Callable[[str], None] = print) -> dict[st
     if done is not None:
         return done
     torch.set_num_threads(config.threads)
-    products = choose_products(config.agent, config.device)
     prepared = prepare(spec)
+    products = choose_products(config.agent, config.device)
     rehearsal = rehearse(lambda: make_env(config.env))
     check_space(config, prepared.networks, run_dir.path, run_dir.checkpoint_folder)
     try:

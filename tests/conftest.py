@@ -1,6 +1,8 @@
 """Fixtures for many tests."""
 
+import signal
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,12 @@ from acmr.checkpoint import FORMAT_VERSION, Teacher, TeacherDescription, load_te
 from acmr.networks import Dimensions, Networks
 
 torch.set_num_threads(1)
+# Tests that are started in the background inherit that Ctrl-C and hanging up are ignored; the programs under test would
+# respect that, and could not be stopped as the tests stop them.
+for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) == signal.SIG_IGN:
+        with suppress(ValueError):
+            signal.signal(number, usual)
 # How long an example takes depends on who shares the machine.
 settings.register_profile("acmr", deadline=None)
 settings.load_profile("acmr")
