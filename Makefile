@@ -29,8 +29,12 @@ $(READY): pyproject.toml constraints.txt
 test: $(READY) ## all tests but the slow ones, in at most 5 minutes on 2 cores
 	python -m pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
 
-test-slow: $(READY) ## the tests that take minutes
+test-slow: $(READY) ## the tests that take minutes: kills, whole sweeps, Slurm
 	python -m pytest -n 2 --dist loadfile -m slow $(ARGS)
+
+torture: $(READY) ## five times as many kills, signals and damaged files: half an hour
+	ACMR_TORTURE=5 python -m pytest -n 2 --dist loadfile -m slow $(ARGS) \
+		tests/test_resume_kills.py tests/test_resume_writes.py tests/test_resume_damage.py
 
 lint: $(READY) ## style, imports and types
 	ruff check .
@@ -73,6 +77,8 @@ bench-check: $(READY) ## the same, and fail if a ratio falls under its target
 	python -m bench.speed --check
 	python -m bench.memory --check
 	python -m bench.cores --check
+	python -m bench.bench_sweeps
+	python -m bench.bench_analysis
 
 profile: $(READY) ## where the time of a training step goes
 	python -m bench.profile_step

@@ -69,7 +69,7 @@ def run_experiment(spec: RunSpec, say: Callable[[str], None] = print) -> dict[st
             if done is not None:
                 return done
             with StopSignals() as stop, no_log_file():
-                return Session(prepared, rehearsal, products, run_dir, stop, say).run()
+                return Attempt(prepared, rehearsal, products, run_dir, stop, say).run()
     except WriteError as error:
         raise StorageError(run_dir.path, error) from error
 
@@ -106,7 +106,7 @@ def _finished(spec: RunSpec, run_dir: RunDir, say: Callable[[str], None]) -> dic
 
 
 @dataclass
-class Session:
+class Attempt:
     """One process's work on a run that it holds."""
 
     prepared: Prepared

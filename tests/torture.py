@@ -183,7 +183,7 @@ def parts(run: Run) -> tuple[RunState, Checkpoints]:
     """The parts of a run in this process, as they are before its first step."""
     prepared, rehearsal, products = found_out(run.overrides)
     prepared = deepcopy(replace(prepared, spec=run.spec))
-    session = experiment.Session(prepared, rehearsal, products, RunDir(run.folder), StopSignals(), print)
+    session = experiment.Attempt(prepared, rehearsal, products, RunDir(run.folder), StopSignals(), print)
     return session.build()
 
 
