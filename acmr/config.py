@@ -21,6 +21,8 @@ TEACHER_KEYS = ("total_timesteps", "agent.hidden_sizes")
 
 TRACKING_MODES = ("off", "offline", "self_hosted")
 PROGRESS_MODES = ("auto", "bar", "lines", "off")
+#: How matrix products are computed.
+PRECISIONS = ("float32", "bfloat16")
 EXACT, INEXACT = "exact", "inexact"
 ACTIVATIONS = ("relu", "none")
 
@@ -64,6 +66,8 @@ class SACConfig:
     target_network_frequency: int = 1
     autotune: bool = True
     alpha: float = 0.2
+    #: Of matrix products: float32 or bfloat16. Weights and optimizers are in float32 either way.
+    precision: str = PRECISIONS[0]
 
 
 @dataclass
@@ -160,6 +164,7 @@ def validate(config: ExperimentConfig) -> None:
             f"agent.hidden_sizes={agent.hidden_sizes}: one or more widths of at least 1 are needed, "
             "as in agent.hidden_sizes=[256,256]"
         )
+    _one_of("agent.precision", agent.precision, PRECISIONS)
     _one_of("progress", config.progress, PROGRESS_MODES)
     _one_of("resume", config.resume, (EXACT, INEXACT))
     _one_of("tracking.mode", config.tracking.mode, TRACKING_MODES)

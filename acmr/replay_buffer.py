@@ -50,6 +50,11 @@ class JoinedBatch(Batch):
         next_inputs = torch.cat((batch.next_observations, torch.zeros_like(batch.actions)), dim=1)
         return JoinedBatch.of(batch.observations.shape[1], inputs, next_inputs, batch.rewards, batch.terminated)
 
+    def to(self, dtype: torch.dtype) -> JoinedBatch:
+        """The same with its observations and actions in another precision."""
+        inputs, next_inputs = self.inputs.to(dtype), self.next_inputs.to(dtype)
+        return JoinedBatch.of(self.observations.shape[1], inputs, next_inputs, self.rewards, self.terminated)
+
 
 class ReplayBuffer:
     """Keeps the last ``capacity`` transitions in float32: 1.6 GB for a million of the Humanoid's.

@@ -73,17 +73,20 @@ class SAC:
 
     def _build_networks(self) -> None:
         actor, critics, dims = self.networks.actor, self.networks.critics, self.networks.dims
-        self._actor_parameters = FlatParameters(_actor_groups(actor))
-        self._critic_parameters = FlatParameters(_critic_groups(critics))
+        self._reduced = self.config.precision == "bfloat16"
+        low_actor, low_critics = ([self._reduced and not head for head in _heads(net)] for net in (actor, critics[0]))
+        self._actor_parameters = FlatParameters(_actor_groups(actor), reduced=low_actor)
+        self._critic_parameters = FlatParameters(_critic_groups(critics), reduced=low_critics)
         target_groups = _critic_groups([target for target in self.targets if isinstance(target, Critic)])
-        self._target_parameters = FlatParameters(target_groups, like=self._critic_parameters)
+        self._target_parameters = FlatParameters(target_groups, self._critic_parameters, low_critics)
         relus = _relus(critics[0])
         self._actor = Stack(self._actor_parameters.blocks, _relus(actor))
         self._critics = CriticStack(self._critic_parameters.blocks, relus, dims.observation)
         self._targets = CriticStack(self._target_parameters.blocks, relus, dims.observation)
         self._policy = SquashedGaussian(actor.action_scale, actor.action_bias)
         in_numpy = self._math is np
-        self._acting = Acting(self._actor.layers, actor.action_scale, actor.action_bias) if in_numpy else None
+        acting = Stack(self._actor_parameters.masters, _relus(actor)).layers
+        self._acting = Acting(acting, actor.action_scale, actor.action_bias) if in_numpy else None
 
     @torch.no_grad()
     def act(self, observation: np.ndarray) -> np.ndarray:
@@ -103,6 +106,8 @@ class SAC:
         with as many updates on this batch, each followed by a temperature update.
         """
         joined = JoinedBatch.join(batch)
+        if self._reduced:
+            joined = joined.to(torch.bfloat16)
         if len(joined.rewards) != self._batch_size:
             self._allocate(len(joined.rewards))
         self._update_critics(joined)
@@ -111,6 +116,7 @@ class SAC:
         if global_step % self.config.target_network_frequency == 0:
             # lerp leaves equal values bitwise equal; frozen layers are no part of these vectors.
             self._target_parameters.trainable.lerp_(self._critic_parameters.trainable, self.config.tau)
+            self._target_parameters.refresh()
 
     def metrics(self) -> dict[str, float]:
         """Means over the updates since the last call; NaN where there were none."""
@@ -145,6 +151,8 @@ class SAC:
             raise ValueError(f"the state is of another agent: {', '.join(differing)} differ")
         for name, tensor in tensors.items():
             tensor.copy_(state["tensors"][name])
+        for parameters in (self._actor_parameters, self._critic_parameters, self._target_parameters):
+            parameters.refresh()
         for name, generator in self._generators.items():
             generator.set_state(state["generators"][name])
         self._sums, self._counts = dict(state["metric_sums"]), dict(state["metric_counts"])
@@ -184,7 +192,11 @@ class SAC:
         values, alpha = self._values, self._alpha_array
         self._actor.forward(batch.next_observations, self._actor_places)
         after = self._draw()
-        array_of(batch.next_inputs)[:, self.networks.dims.observation :] = after.actions
+        room = batch.next_inputs[:, self.networks.dims.observation :]
+        if self._reduced:  # NumPy has no bfloat16
+            room.copy_(tensor_of(after.actions))
+        else:
+            array_of(room)[...] = after.actions
         self._targets.forward(batch.next_inputs, self._critic_places)
         soft_value = self._math.minimum(values[0], values[1]) - alpha * after.log_prob
         # Truncation is not an end: only a terminated transition has no future (reference, section 2).
@@ -196,7 +208,9 @@ class SAC:
         # Each critic's loss is the mean of the squared errors.
         self._of_values[...] = errors * (2.0 / self._batch_size)
         self._critics.backward(batch.inputs, self._critic_places)
+        self._critic_parameters.collect()
         self._optimizers["critics"].step()
+        self._critic_parameters.refresh()
         losses, means = (errors * errors) @ self._average, values @ self._average
         self._record(critic_loss=losses[0] + losses[1], q_value_1=means[0], q_value_2=means[1])
 
@@ -222,7 +236,9 @@ class SAC:
         of_actions = array_of(self._critics.action_gradient(self._critic_places))
         self._policy.backward(sample, of_actions, alpha * share, self._of_mean, self._of_raw)
         self._actor.backward(observations, self._actor_places)
+        self._actor_parameters.collect()
         self._optimizers["actor"].step()
+        self._actor_parameters.refresh()
         log_prob, value = sample.log_prob @ self._average, self._math.minimum(first, second) @ self._average
         self._record(actor_loss=alpha[0] * log_prob - value, entropy=-log_prob)
 
@@ -256,7 +272,12 @@ def _critic_groups(critics: Sequence[Critic]) -> list[Group]:
 
 def _relus(network: Trunk) -> list[bool]:
     """Whether ReLU follows, for each group of layers in the order of their application."""
-    relus = [network.adapter_relu] if network.input_adapter is not None else []
-    relus += [True] * (1 + len(network.hidden_names))
+    adapter = [network.adapter_relu] if network.input_adapter is not None else []
+    return adapter + [not head for head in _heads(network)[len(adapter) :]]
+
+
+def _heads(network: Trunk) -> list[bool]:
+    """Whether it belongs to the head, which has no ReLU, for each group of layers in the order of their application."""
+    trunk = (network.input_adapter is not None) + 1 + len(network.hidden_names)
     heads = 2 if isinstance(network, Actor) and network.mean_adapter is not None else 1
-    return relus + [False] * heads
+    return [False] * trunk + [True] * heads

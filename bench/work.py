@@ -109,14 +109,14 @@ def bytes_of_step(networks: Networks, batch: int) -> int:
 class ProductTimer:
     """Runs a step's products alone, each on memory of its own, as fast as torch runs them here."""
 
-    def __init__(self, work: Work) -> None:
+    def __init__(self, work: Work, dtype: torch.dtype = torch.float32) -> None:
         # Products with one column are sums, no matrix products: counted as work, but not timed as such.
         self._counts = {product: count for product, count in work.items() if min(product.columns, product.inner) > 1}
         self._operands = {
             product: (
-                torch.randn(product.rows, product.inner),
-                torch.randn(product.inner, product.columns),
-                torch.empty(product.rows, product.columns),
+                torch.randn(product.rows, product.inner).to(dtype),
+                torch.randn(product.inner, product.columns).to(dtype),
+                torch.empty(product.rows, product.columns, dtype=dtype),
             )
             for product in self._counts
         }

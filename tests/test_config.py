@@ -86,6 +86,7 @@ def test_python_defaults_say_what_the_paper_profile_says():
         (["+foo=1"], "foo: no such setting"),
         (["+agent.foo=1"], "agent.foo: no such setting"),
         (["transfer=hiden"], "must be one of direct, expand, hidden, none; did you mean transfer=hidden?"),
+        (["agent.precision=half"], "agent.precision=half: must be one of float32, bfloat16"),
         (["env=humanoyd"], "did you mean env=humanoid?"),
         (["experiment=A9"], "must be one of A0, A1, A2, A3, A4, H0, H1"),
         (["transfer=none", "freeze=true"], "type transfer=hidden freeze=true or transfer=none freeze=false"),

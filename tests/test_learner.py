@@ -1,6 +1,7 @@
 """The learner's parts against autograd, torch's own Adam, and the public networks; and going on from a saved state."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from torch import nn
 
 from acmr import matmul
-from acmr.config import SACConfig
+from acmr.config import PRECISIONS, SACConfig
 from acmr.learner import arrays
 from acmr.learner.layers import CriticStack, Stack, columns
 from acmr.learner.parameters import Adam, FlatParameters
@@ -30,8 +31,8 @@ def make_networks(core: Dimensions | None = None, sizes: tuple[int, ...] = (24, 
     return Networks(DIMS, sizes, LOW, HIGH, generator(0), core)
 
 
-def make_agent(core: Dimensions | None = None) -> SAC:
-    return SAC(make_networks(core), CONFIG, generator(1), generator(2))
+def make_agent(core: Dimensions | None = None, precision: str = "float32") -> SAC:
+    return SAC(make_networks(core), replace(CONFIG, precision=precision), generator(1), generator(2))
 
 
 def filled_buffer() -> ReplayBuffer:
@@ -168,10 +169,11 @@ def test_twins_frozen_apart_are_refused():
         SAC(networks, CONFIG, generator(1), generator(2))
 
 
+@pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("core", [None, CORE], ids=["plain", "adapted"])
-def test_a_restored_learner_goes_on_bit_for_bit(core):
+def test_a_restored_learner_goes_on_bit_for_bit(core, precision):
     buffer, rng = filled_buffer(), np.random.default_rng(3)
-    agent, restored = make_agent(core), make_agent(core)
+    agent, restored = make_agent(core, precision), make_agent(core, precision)
 
     def go_on(learner: SAC, rng: np.random.Generator) -> list[np.ndarray]:
         actions = []
@@ -191,6 +193,39 @@ def test_a_restored_learner_goes_on_bit_for_bit(core):
     assert all(torch.equal(value, theirs["tensors"][name]) for name, value in ours["tensors"].items())
     assert all(torch.equal(value, theirs["generators"][name]) for name, value in ours["generators"].items())
     assert agent.metrics() == restored.metrics()
+
+
+@pytest.mark.parametrize("core", [None, CORE], ids=["plain", "adapted"])
+@pytest.mark.parametrize("freeze", [False, True], ids=["free", "frozen"])
+@pytest.mark.parametrize("devices", [{"cpu"}, set()], ids=["numpy", "torch"])
+def test_bfloat16_takes_the_steps_of_float32_but_for_its_rounding(core, freeze, devices, monkeypatch):
+    monkeypatch.setattr(arrays, "NUMPY_DEVICES", devices)
+    buffer, agents, frozen = filled_buffer(), [], 0
+    for precision in PRECISIONS:
+        networks = make_networks(core)
+        for name, layer in networks.layers().items():
+            layer.requires_grad_(not freeze or not name.endswith("hidden_1"))
+        agents.append(SAC(networks, replace(CONFIG, precision=precision), generator(1), generator(2)))
+    before = copy.deepcopy(agents[0].networks.state_dict())
+    for agent in agents:
+        rng = np.random.default_rng(3)
+        for step in range(1, 41):
+            agent.update(buffer.sample(16, rng), step)
+    exact, reduced = (agent.networks.state_dict() for agent in agents)
+    for name, start in before.items():
+        assert reduced[name].dtype == torch.float32
+        if torch.equal(start, exact[name]):
+            assert torch.equal(start, reduced[name]), name
+            frozen += 1
+            continue
+        taken, wanted = (reduced[name] - start).flatten(), (exact[name] - start).flatten()
+        # 8 bits of precision: the way of 40 steps has the same direction and length, and is not the same.
+        assert torch.cosine_similarity(taken, wanted, dim=0) > 0.98, name
+        assert float(taken.norm() / wanted.norm()) == pytest.approx(1.0, rel=0.1), name
+        assert not torch.equal(taken, wanted), name
+    assert (frozen > 0) == freeze
+    for name, target in agents[1].targets.state_dict().items():
+        assert torch.allclose(target, agents[0].targets.state_dict()[name], atol=1e-2), name
 
 
 def test_the_state_of_another_agent_is_refused():

@@ -36,9 +36,15 @@ class Place:
         self.output = layer.weight.new_zeros(layer.networks, batch_size, layer.fan_out)
         self.gradient = torch.zeros_like(self.output)
         self.outputs, self.gradients = list(self.output), list(self.gradient)
-        empty = self.output.new_empty(0, 0, 0)
-        self.inputs = columns(below.output, layer.networks) if below else empty
-        self.input_gradient = columns(below.gradient, layer.networks) if below else empty
+        read = written = self.output.new_empty(0, 0, 0)
+        self._below = None
+        if below:
+            read, written = below.output, below.gradient
+            if below.output.dtype != self.output.dtype:
+                read, written = (torch.zeros_like(tensor, dtype=self.output.dtype) for tensor in (read, written))
+                self._below = (below.output, below.gradient, read, written)
+            read, written = columns(read, layer.networks), columns(written, layer.networks)
+        self.inputs, self.input_gradient = read, written
         self.inputs_transposed = self.inputs.transpose(1, 2)
         # Of a layer with one output, by network: inputs (batch, in), output and its gradient (batch,).
         self.vectors: list[tuple[Array, Array, Array]] = []
@@ -47,6 +53,18 @@ class Place:
                 (array_of(inputs), array_of(output[:, 0]), array_of(gradient[:, 0]))
                 for inputs, output, gradient in zip(self.inputs, self.output, self.gradient, strict=True)
             ]
+
+    def fetch(self) -> None:
+        """Brings the output of a layer below that has another precision to ``inputs``."""
+        if self._below:
+            output, _, read, _ = self._below
+            read.copy_(output)
+
+    def hand_down(self) -> None:
+        """Brings ``input_gradient`` to a layer below that has another precision."""
+        if self._below:
+            _, gradient, _, written = self._below
+            gradient.copy_(written)
 
 
 def columns(tensor: Tensor, parts: int) -> Tensor:
@@ -74,6 +92,7 @@ class Dense:
 
     def forward(self, place: Place) -> None:
         """Writes the output."""
+        place.fetch()
         torch.bmm(place.inputs, self.weight, out=place.output)
         self.finish(place.output)
 
@@ -109,6 +128,7 @@ class Dense:
     def input_gradient(self, place: Place) -> None:
         """Writes the gradient of the inputs."""
         torch.bmm(place.gradient, self._transposed, out=place.input_gradient)
+        place.hand_down()
 
 
 class Scalar(Dense):
@@ -123,6 +143,7 @@ class Scalar(Dense):
 
     def forward(self, place: Place) -> None:
         """Writes the output."""
+        place.fetch()
         for vector, (inputs, output, _) in zip(self._vectors, place.vectors, strict=True):
             self._math.matmul(inputs, vector, out=output)
         self.finish(place.output)
@@ -136,6 +157,7 @@ class Scalar(Dense):
     def input_gradient(self, place: Place) -> None:
         """Writes the gradient of the inputs."""
         torch.mul(place.gradient, self._transposed, out=place.input_gradient)
+        place.hand_down()
 
 
 class Stack:
@@ -221,6 +243,7 @@ class CriticStack(Stack):
 
     def forward_actions(self, actions: Tensor, places: Sequence[Place]) -> Tensor:
         """Values, (networks, batch, 1), of actions (batch, action) at the observations that were shared."""
+        actions = actions.to(self.layers[0].weight.dtype)
         for shared, weight, sums in zip(self._shared, self._of_actions, places[0].outputs, strict=True):
             torch.addmm(shared, actions, weight, out=sums)
         if self.layers[0].relu:
@@ -234,4 +257,4 @@ class CriticStack(Stack):
         gradient = torch.mm(first, weight)
         for of_network, weight in zip(others, weights, strict=True):
             torch.addmm(gradient, of_network, weight, out=gradient)
-        return gradient
+        return gradient.to(places[-1].gradient.dtype)

@@ -35,47 +35,66 @@ class FlatParameters:
         groups: The layers, in the order in which they are applied.
         like: Parameters of the same groups, whose frozen layers count as frozen here; None: those that do not
             require gradients.
+        reduced: For each group whether its products are computed in bfloat16, from a copy of its parameters.
 
     Attributes:
         values: All parameters.
         trainable: The beginning of ``values`` that is learned.
         gradient: Gradient of ``trainable``, to be written to.
-        blocks: The groups' parameters and gradients, as views.
+        masters: The groups' parameters and gradients, as views.
+        blocks: The same as products read and write them: for reduced groups views of copies in bfloat16.
 
     Raises:
         ValueError: If a group is frozen in part.
     """
 
-    def __init__(self, groups: Sequence[Group], like: FlatParameters | None = None) -> None:
+    def __init__(
+        self, groups: Sequence[Group], like: FlatParameters | None = None, reduced: Sequence[bool] = ()
+    ) -> None:
         self.frozen: list[bool] = [_is_frozen(group) for group in groups] if like is None else like.frozen
+        reduced = reduced or [False] * len(groups)
         device, dtype = groups[0][0][0].weight.device, groups[0][0][0].weight.dtype
-        sizes = [_padded_sizes(group) for group in groups]
-        order = sorted(range(len(groups)), key=lambda index: self.frozen[index])
-        ends = torch.tensor([0, *(sum(sizes[index]) for index in order)]).cumsum(0).tolist()
+        sizes = [sum(_padded_sizes(group)) for group in groups]
+        # What learns comes first, and of that what is reduced, so that one copy collects its gradients.
+        order = sorted(range(len(groups)), key=lambda index: (self.frozen[index], not reduced[index]))
+        ends = torch.tensor([0, *(sizes[index] for index in order)]).cumsum(0).tolist()
         starts = dict(zip(order, ends, strict=False))
         count = ends[sum(not frozen for frozen in self.frozen)]
         self.values = torch.zeros(ends[-1], device=device, dtype=dtype)
         self.trainable, self.gradient = self.values[:count], torch.zeros(count, device=device, dtype=dtype)
-        self.blocks = [
-            self._block(group, starts[index], sizes[index][0], self.frozen[index]) for index, group in enumerate(groups)
-        ]
+        self.masters = [self._block(group, starts[index], index) for index, group in enumerate(groups)]
+        for group, block in zip(groups, self.masters, strict=True):
+            _move_into(block, group)
+        self.blocks, self._copies = self.masters, None
+        if any(reduced):
+            low_values, low_gradient = self._copies = self.values.bfloat16(), self.gradient.bfloat16()
+            self._collected = ends[sum(low and not frozen for low, frozen in zip(reduced, self.frozen, strict=True))]
+            self.blocks = [
+                self._block(group, starts[index], index, low_values, low_gradient) if low else self.masters[index]
+                for index, (group, low) in enumerate(zip(groups, reduced, strict=True))
+            ]
 
-    def _block(self, group: Group, start: int, weights: int, frozen: bool) -> Block:
+    def refresh(self) -> None:
+        """Lets products see values that have changed."""
+        if self._copies:
+            self._copies[0].copy_(self.values)
+
+    def collect(self) -> None:
+        """Brings gradients that reduced products have written to ``gradient``."""
+        if self._copies:
+            self.gradient[: self._collected].copy_(self._copies[1][: self._collected])
+
+    def _block(self, group: Group, start: int, index: int, *vectors: Tensor) -> Block:
         networks, fan_in, fan_out = _shape(group)
+        weights, _ = _padded_sizes(group)
 
         def views(vector: Tensor) -> tuple[Tensor, Tensor]:
             weight = vector[start : start + networks * fan_in * fan_out].view(networks, fan_in, fan_out)
             bias = vector[start + weights : start + weights + networks * fan_out].view(networks, 1, fan_out)
             return weight, bias
 
-        weight, bias = views(self.values)
-        for network, layers in enumerate(group):
-            column = 0
-            for layer in layers:
-                columns = slice(column, column := column + layer.out_features)
-                _move(layer.weight, weight[network, :, columns].t())
-                _move(layer.bias, bias[network, 0, columns])
-        return Block(weight, bias, *((None, None) if frozen else views(self.gradient)))
+        values, gradient = vectors or (self.values, self.gradient)
+        return Block(*views(values), *((None, None) if self.frozen[index] else views(gradient)))
 
 
 class Adam:
@@ -131,6 +150,15 @@ def _padded_sizes(group: Group) -> tuple[int, int]:
     networks, fan_in, fan_out = _shape(group)
     weights, biases = networks * fan_in * fan_out, networks * fan_out
     return weights + -weights % _ALIGNMENT, biases + -biases % _ALIGNMENT
+
+
+def _move_into(block: Block, group: Group) -> None:
+    for network, layers in enumerate(group):
+        column = 0
+        for layer in layers:
+            columns = slice(column, column := column + layer.out_features)
+            _move(layer.weight, block.weight[network, :, columns].t())
+            _move(layer.bias, block.bias[network, 0, columns])
 
 
 def _move(parameter: Tensor, place: Tensor) -> None:
