@@ -20,6 +20,7 @@ from analysis.report import Picture, Report, data_uri, write_report
 from analysis.settings import setting_differences
 from analysis.style import apply
 from analysis.tables import (
+    STEPS_COLUMNS,
     paper_columns,
     scores,
     steps_table,
@@ -122,7 +123,7 @@ def _write_tables(analysis: Analysis, out: Path, written: Written) -> dict[str, 
         ("published_table3", tables["published"], "Table 3 beside the published one.", None),
         ("transfer", tables["transfer"], "Transfer metrics.", None),
         ("cells", analysis.cells, "Steps to threshold by group.", None),
-        ("steps_to_threshold", steps_table(measured), "Steps to threshold of each run.", None),
+        ("steps_to_threshold", steps_table(measured), "Steps to threshold of each run.", STEPS_COLUMNS),
     ]
     if len(analysis.others):
         plan.append(("comparisons", analysis.others, "Groups that are no cells of the paper.", paper_columns()))

@@ -20,8 +20,15 @@ CONFIGURATIONS = {"H0": "Baseline", "H1": "POC", "A0": "Baseline"} | {f"A{n}": f
 #: What a cell's transfer is measured against.
 BASELINES = {"H0": None, "H1": "H0", "A0": None}
 
+#: Columns of the table of runs for print; its CSV has more.
+STEPS_COLUMNS = [
+    *("group", "seed", "state", "steps_to_threshold", "steps_to_threshold_first", "episodes"),
+    *("initial_return", "asymptotic_return", "area_under_curve"),
+]
 #: Columns beyond which a LaTeX table spans both columns of a paper.
 WIDE = 6
+#: Letters of a cell beyond which LaTeX breaks its lines.
+SENTENCE = 30
 
 _COUNTS = ("n_", "runs", "censored", "seed", "episodes", "reached")
 _STEPS = ("mean_", "std_", "difference", "restricted_", "steps", "low", "high", "horizon", "last_step", "mean", "std")
@@ -144,16 +151,35 @@ def write_table(table: pd.DataFrame, out: Path, name: str, caption: str, columns
     shown.columns = pd.Index([heading(str(name)) for name in shown.columns])
     markdown = shown.to_markdown(index=False, disable_numparse=True, colalign=alignment)
     (out / f"{name}.md").write_text(markdown + "\n", encoding="utf-8")
-    latex = shown.style.hide(axis="index").format(escape="latex").format_index(escape="latex", axis=1)
-    text = latex.to_latex(
+    (out / f"{name}.tex").write_text(_latex(shown, alignment, name, caption), encoding="utf-8")
+
+
+def _latex(shown: pd.DataFrame, alignment: list[str], name: str, caption: str) -> str:
+    """A table as narrow as it can be: headings one word a line, and smaller letters where there are many columns."""
+    sides, wide = [side[0] for side in alignment], len(shown.columns) > WIDE
+    longest = [max(map(len, shown[column]), default=0) for column in shown.columns]
+    widths = ["p{11em}" if length > SENTENCE else side for length, side in zip(longest, sides, strict=True)]
+    cells = shown.style.hide(axis="index").format(_with_minus, escape="latex")
+    escaped = cells.format_index(escape="latex", axis=1).to_latex(
         hrules=True,
         caption=caption,
-        environment="table*" if len(shown.columns) > WIDE else "table",
+        environment="table*" if wide else "table",
         label=f"tab:{name}",
         position_float="centering",
-        column_format="".join(side[0] for side in alignment),
+        column_format="".join(widths),
     )
-    (out / f"{name}.tex").write_text(text, encoding="utf-8")
+    before, head, after = re.split(r"(?<=\\toprule\n)(.*)(?= \\\\\n)", escaped, maxsplit=1)
+    stacks = [_stacked(words, side) for words, side in zip(head.split(" & "), sides, strict=True)]
+    small = "\\centering\n\\footnotesize\n\\setlength{\\tabcolsep}{2.5pt}\n"
+    return (before.replace("\\centering\n", small) if wide else before) + " & ".join(stacks) + after
+
+
+def _with_minus(text: object) -> str:
+    return re.sub(r"^-(?=\d)", "$-$", str(text))
+
+
+def _stacked(words: str, side: str) -> str:
+    return rf"\shortstack[{side}]{{{words.replace(' ', chr(92) * 2)}}}" if " " in words else words
 
 
 def readable(table: pd.DataFrame, missing: str = "NaN") -> pd.DataFrame:

@@ -221,6 +221,15 @@ def test_table_files(tmp_path):
     assert back == pytest.approx(table["t_score"].tolist(), rel=0, abs=0, nan_ok=True)
     latex = (tmp_path / "table3.tex").read_text()
     assert all(word in latex for word in (r"\toprule", r"\midrule", r"\bottomrule", "T-score", "A0 & A4 & 3 & 0"))
+    # The heading one word a line, negative numbers with a minus sign.
+    assert r" & \shortstack[r]{n\\reference} & " in latex
+    assert "$-$" in latex
+    assert " -" not in latex
+    write_table(table1(), tmp_path, "table1", "A & B")
+    narrow = (tmp_path / "table1.tex").read_text()
+    assert r"\begin{table}" in narrow
+    assert "footnotesize" in latex.replace(narrow, "")
+    assert "footnotesize" not in narrow
     assert len((tmp_path / "table3.md").read_text().splitlines()) == 2 + len(PAPER_ROWS)
 
 
