@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 
-.PHONY: help setup test test-slow torture lint format demo paper status paper-figures report dashboard sync bench bench-check profile clean
+.PHONY: help setup test test-slow torture lint format demo paper status paper-figures report publish dashboard sync bench bench-check profile clean
 
 help: ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
@@ -61,6 +61,9 @@ paper-figures: $(READY) ## every table and figure from the runs of PROFILE (defa
 
 report: paper-figures ## the same, and where the report lies
 	@echo "open results/$(PROFILE)/report.html"
+
+publish: $(READY) ## add the finished runs of PROFILE to results/, without what is large, to be committed
+	@python -m analysis.publish $(RUNS)/$(PROFILE) results/$(PROFILE)
 
 dashboard: $(READY) ## browse all runs in the terminal, offline
 	python -m acmr.mirror dashboard $(RUNS)/wandb

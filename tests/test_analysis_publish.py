@@ -1,0 +1,87 @@
+"""What is published of finished runs is analyzed like the runs themselves."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from analysis_runs import rows_reaching, run_directory, write_run
+
+from analysis.load import load
+from analysis.publish import PublishError, publish
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    root = tmp_path / "runs" / "paper"
+    for cell, steps in (("H0", 9000), ("A0", 8000)):
+        folder = write_run(root, cell, 1, rows_reaching(steps, 20_000), total=20_000)
+        for name in ("teacher.safetensors", "teacher.json", "run.log", "evaluation.json"):
+            (folder / name).write_text(name)
+        (folder / "checkpoint").mkdir()
+    # Long enough to be compressed.
+    write_run(root, "A1", 1, rows_reaching(None, 1_000_000, length=50), total=1_000_000)
+    write_run(root, "A2", 1, rows_reaching(None, 20_000), summary=False)
+    return root
+
+
+def test_what_is_published_is_analyzed_as_the_runs_are(runs, tmp_path):
+    out = tmp_path / "results" / "paper"
+    added, there = publish(runs, out)
+    assert len(added) == 3
+    assert there == []
+    shutil.rmtree(run_directory(runs, "A2", 1))
+    ours, theirs = load(out), load(runs)
+    pd.testing.assert_frame_equal(ours.runs, theirs.runs)
+    pd.testing.assert_frame_equal(ours.episodes, theirs.episodes)
+    assert ours.configs == theirs.configs
+
+
+def test_only_what_others_need_is_published(runs, tmp_path):
+    publish(runs, tmp_path)
+    names = {
+        cell: sorted(path.name for path in run_directory(tmp_path, cell, 1).glob("*")) for cell in ("H0", "A0", "A1")
+    }
+    assert names["A0"] == ["config.yaml", "episodes.csv", "summary.json"]
+    assert names["H0"] == [*names["A0"], "teacher.json", "teacher.safetensors"]
+    assert names["A1"] == ["config.yaml", "episodes.csv.gz", "summary.json"]
+    assert not run_directory(tmp_path, "A2", 1).exists()
+
+
+def test_later_runs_are_added_and_others_stay(runs, tmp_path):
+    out = tmp_path / "results"
+    publish(runs, out)
+    write_run(runs, "A0", 2, rows_reaching(7000, 20_000), total=20_000)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+    added, there = publish(runs, out)
+    assert [path.name for path in added] == ["seed_2"]
+    assert len(there) == 3
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_another_result_of_a_run_is_not_overwritten(runs, tmp_path):
+    publish(runs, tmp_path)
+    path = run_directory(tmp_path, "A0", 1) / "summary.json"
+    path.write_text(json.dumps({"other": 1}))
+    write_run(runs, "A0", 2, rows_reaching(7000, 20_000), total=20_000)
+    with pytest.raises(PublishError, match=r"seed_1: summary.json of another run there; remove"):
+        publish(runs, tmp_path)
+    assert json.loads(path.read_text()) == {"other": 1}
+    assert not run_directory(tmp_path, "A0", 2).exists()
+
+
+@pytest.mark.parametrize("make", [True, False])
+def test_nothing_to_publish_is_said_in_one_line(make, tmp_path):
+    if make:
+        write_run(tmp_path / "runs", "A0", 1, rows_reaching(None, 20_000), summary=False)
+    command = [sys.executable, "-m", "analysis.publish", str(tmp_path / "runs"), str(tmp_path / "out")]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    said = "no run has come to its end there; make status says how far they are"
+    assert ended.stderr == f"analysis.publish: {tmp_path / 'runs'}: {said}\n"
+    assert not (tmp_path / "out").exists()
