@@ -12,6 +12,8 @@ from pathlib import Path
 
 # Hydra would print several lines and exit; with this it hands us the error, and the user gets one line.
 os.environ["HYDRA_FULL_ERROR"] = "1"
+# Training draws nothing, but mujoco cannot even be imported where this names a library that is missing.
+os.environ.pop("MUJOCO_GL", None)
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
