@@ -75,7 +75,7 @@ bench: $(READY) ## our learner beside Stable-Baselines3 and SBX, and beside what
 	python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
 	python -m bench.speed
 
-bench-check: $(READY) ## the same, and fail if a ratio falls under its target
+bench-check: $(READY) ## the same, and sweeps and analysis; fail if a figure falls under its floor
 	python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
 	python -m bench.speed --check
 	python -m bench.memory --check

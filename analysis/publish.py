@@ -59,7 +59,10 @@ def publish(runs: Path, out: Path) -> tuple[list[Path], list[Path]]:
 
 def _files(run: Path) -> dict[str, bytes]:
     """Names and contents of what is published of a run; nothing if it has not come to its end."""
-    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    try:
+        summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    except ValueError:
+        raise PublishError(f"{run / 'summary.json'}: cannot be read; move that run away, or make it anew") from None
     if summary.get("status") not in ("complete", "diverged"):
         return {}
     names = (*RECORDS, *(TEACHER if _teaches(summary) else ()))

@@ -75,6 +75,13 @@ def test_another_result_of_a_run_is_not_overwritten(runs, tmp_path):
     assert not run_directory(tmp_path, "A0", 2).exists()
 
 
+def test_a_damaged_summary_is_named(runs, tmp_path):
+    (run_directory(runs, "A0", 1) / "summary.json").write_text("{")
+    with pytest.raises(PublishError, match=r"armless_humanoid-none/seed_1/summary.json: cannot be read"):
+        publish(runs, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("make", [True, False])
 def test_nothing_to_publish_is_said_in_one_line(make, tmp_path):
     if make:
