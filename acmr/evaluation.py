@@ -1,6 +1,6 @@
 """Uses what a run has learned: evaluates its policy, films it, draws its robot.
 
-``python -m acmr.evaluation RUN_DIR [--episodes N] [--video FILE.mp4]`` and
+``python -m acmr.evaluation RUN_DIR [--episodes N] [--video FILE.mp4 [--seconds S]]`` and
 ``python -m acmr.evaluation still ENVIRONMENT --out FILE.png``.
 """
 
@@ -9,9 +9,10 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import math
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,74 +20,17 @@ import imageio.v2 as imageio
 import numpy as np
 import torch
 
+from acmr.camera import is_robot, make_camera, without_gl
 from acmr.checkpoint import Teacher, load_teacher
 from acmr.config import ConfigError, EnvConfig
 from acmr.durable import write_bytes
-from acmr.networks import Actor
+from acmr.rollout import Episode, Shot, play, render_mode
 from acmr.run_dir import RunDir
-from acmr.video import Film, is_robot, make_camera, without_gl
+from acmr.video import FILM_SUFFIXES
 
 RESULT_FILE = "evaluation.json"
 #: Where a still is seen from, in degrees, and how close, relative to the camera that follows a robot.
 _STILL_AZIMUTH, _STILL_CLOSENESS = 150.0, 0.85
-
-
-@dataclass(frozen=True)
-class Episode:
-    """One episode of an evaluation.
-
-    Attributes:
-        seed: What the environment was reset with.
-        episodic_return: Sum of the raw rewards.
-        episode_length: Steps in the episode.
-        terminated: Whether the environment ended it, not its time limit.
-    """
-
-    seed: int
-    episodic_return: float
-    episode_length: int
-    terminated: bool
-
-
-def play(
-    actor: Actor, config: EnvConfig, *, episodes: int, seed: int, stochastic: bool, video: Path | None = None
-) -> Iterator[Episode]:
-    """Plays episodes, each the same whatever came before it.
-
-    Args:
-        actor: The policy.
-        config: Where it acts.
-        episodes: How many to play.
-        seed: The k-th episode (k = 0, 1, ...) is reset with ``seed + k``.
-        stochastic: Sample actions, as in training; else take the mean action.
-        video: An mp4 file to film the first episode in.
-
-    Raises:
-        ConfigError: If the environment cannot be made.
-    """
-    from acmr.envs import make_env
-
-    env = make_env(config, render_mode=None if video is None else _render_mode(config))
-    film = Film(video, env) if video is not None else None
-    try:
-        for number in range(episodes):
-            noise = torch.Generator().manual_seed(seed + number)
-            observation, _ = env.reset(seed=seed + number)
-            total, length, terminated, truncated = 0.0, 0, False, False
-            while not (terminated or truncated):
-                if film is not None:
-                    film.step()
-                action = _act(actor, observation, noise if stochastic else None)
-                observation, reward, terminated, truncated, _ = env.step(action)
-                total, length = total + float(reward), length + 1
-            if film is not None:
-                film.close()
-                film = None
-            yield Episode(seed + number, total, length, bool(terminated))
-    finally:
-        if film is not None:
-            film.close()
-        env.close()
 
 
 def load_run(path: Path) -> tuple[Teacher, EnvConfig]:
@@ -136,6 +80,7 @@ def report(episodes: Sequence[Episode], **about: Any) -> dict[str, Any]:
     """What ``evaluation.json`` says; the standard deviation is that of these episodes (divided by their number)."""
     returns = [episode.episodic_return for episode in episodes]
     lengths = [episode.episode_length for episode in episodes]
+    velocities = [value for episode in episodes if (value := episode.mean_forward_velocity) is not None]
     return {
         **about,
         "episodes": len(episodes),
@@ -144,6 +89,7 @@ def report(episodes: Sequence[Episode], **about: Any) -> dict[str, Any]:
         "min_return": float(np.min(returns)),
         "max_return": float(np.max(returns)),
         "mean_length": float(np.mean(lengths)),
+        "mean_forward_velocity": float(np.mean(velocities)) if velocities else None,
         "each": [asdict(episode) for episode in episodes],
     }
 
@@ -156,14 +102,15 @@ def evaluate(given: argparse.Namespace) -> None:
         print(f"warning: {remark}", file=sys.stderr)
     actor = teacher.build_networks().actor.eval()
     episodes = []
+    shot = Shot(given.video, given.seconds, given.width, given.height) if given.video else None
     for episode in play(
-        actor, config, episodes=given.episodes, seed=given.seed, stochastic=given.stochastic, video=given.video
+        actor, config, episodes=given.episodes, seed=given.seed, stochastic=given.stochastic, shot=shot
     ):
         episodes.append(episode)
         end = "terminated" if episode.terminated else "time limit"
         print(
             f"episode {len(episodes):>3}  seed {episode.seed:>3}  return {episode.episodic_return:>10,.1f}  "
-            f"length {episode.episode_length:>5}  {end}",
+            f"length {episode.episode_length:>5}{_velocity(episode.mean_forward_velocity)}  {end}",
             flush=True,
         )
     content = report(
@@ -176,8 +123,8 @@ def evaluate(given: argparse.Namespace) -> None:
         same_robot=remark is None,
     )
     print(
-        f"mean {content['mean_return']:,.1f}  standard deviation {content['std_return']:,.1f}  "
-        f"over {len(episodes)} episodes, {content['policy']} policy"
+        f"mean {content['mean_return']:,.1f}  standard deviation {content['std_return']:,.1f}"
+        f"{_velocity(content['mean_forward_velocity'])}  over {len(episodes)} episodes, {content['policy']} policy"
     )
     path = given.out or given.run_dir / RESULT_FILE
     try:
@@ -188,6 +135,10 @@ def evaluate(given: argparse.Namespace) -> None:
     print(f"written: {path}")
 
 
+def _velocity(value: float | None) -> str:
+    return "" if value is None else f"  velocity {value:>5.2f} m/s"
+
+
 def still(given: argparse.Namespace) -> None:
     """Draws the pose that an environment begins with, as a PNG file."""
     from acmr.envs import make_env
@@ -195,7 +146,7 @@ def still(given: argparse.Namespace) -> None:
 
     name = given.environment
     config = read_leaf(name) if name in leaves() else EnvConfig(name=name, id=name, source=name)
-    env = make_env(config, render_mode=_render_mode(config))
+    env = make_env(config, render_mode=render_mode(config))
     env.reset(seed=0)
     robot: Any = env.unwrapped
     if is_robot(env):
@@ -232,8 +183,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         parser = argparse.ArgumentParser(prog="python -m acmr.evaluation still", description=still.__doc__)
         parser.add_argument("environment", help="an environment of conf/env, or any Gymnasium id")
         parser.add_argument("--out", type=Path, required=True, metavar="FILE.png")
-        parser.add_argument("--width", type=_positive, default=480)
-        parser.add_argument("--height", type=_positive, default=480)
+        _add_size(parser)
         parser.set_defaults(action=still)
         return parser.parse_args(arguments[1:])
     parser = argparse.ArgumentParser(
@@ -246,14 +196,25 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; the next ones count up")
     parser.add_argument("--stochastic", action="store_true", help="sample actions, as in training")
     parser.add_argument(
-        "--video", type=_mp4, metavar="FILE.mp4", help="film the first episode (0.2 s a frame without a GPU)"
+        "--video", type=_film, metavar="FILE.mp4", help="film the first episode; or .gif (0.2 s a frame without a GPU)"
     )
+    parser.add_argument(
+        "--seconds", type=_seconds, metavar="S", help="of the film: S seconds of simulated time, episode after episode"
+    )
+    _add_size(parser)
     parser.add_argument("--out", type=Path, metavar="FILE.json", help=f"default: {RESULT_FILE} in the run directory")
     parser.set_defaults(action=evaluate)
     given = parser.parse_args(arguments)
     if given.seed < 0:
         parser.error(f"--seed {given.seed}: an integer of at least 0 is needed")
+    if given.seconds is not None and given.video is None:
+        parser.error(f"--seconds {given.seconds:g}: there is no film; type --video FILE.mp4 as well")
     return given
+
+
+def _add_size(parser: argparse.ArgumentParser) -> None:
+    for name in ("--width", "--height"):
+        parser.add_argument(name, type=_positive, default=480, metavar="PIXELS", help="of the picture; default: 480")
 
 
 def _positive(text: str) -> int:
@@ -262,29 +223,20 @@ def _positive(text: str) -> int:
     return int(text)
 
 
-def _mp4(text: str) -> Path:
-    if not text.endswith(".mp4"):
-        raise argparse.ArgumentTypeError(f"{text}: the name must end in .mp4")
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: a number of seconds above 0 is needed")
+    return value
+
+
+def _film(text: str) -> Path:
+    if not text.endswith(FILM_SUFFIXES):
+        raise argparse.ArgumentTypeError(f"{text}: the name must end in {' or '.join(FILM_SUFFIXES)}")
     return Path(text)
-
-
-def _render_mode(config: EnvConfig) -> str | None:
-    """How an environment must be made to be drawn: robots are drawn from outside."""
-    from acmr.envs import make_env
-
-    env = make_env(config)
-    env.close()
-    return None if is_robot(env) else "rgb_array"
-
-
-def _act(actor: Actor, observation: np.ndarray, noise: torch.Generator | None) -> np.ndarray:
-    with torch.no_grad():
-        batch = torch.as_tensor(observation, dtype=torch.float32).unsqueeze(0)
-        if noise is None:
-            action: torch.Tensor = actor.mode(batch)
-        else:
-            action, _ = actor.sample(batch, torch.randn(1, actor.action_scale.numel(), generator=noise))
-    return action[0].numpy()
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from acmr.mirror import replay
 from acmr.preparation import Prepared, prepare
 from acmr.progress import RunProgress, make_progress
 from acmr.recorder import Recorder, RunLogs
+from acmr.records import EpisodeInProgress
 from acmr.replay_buffer import ReplayBuffer
 from acmr.resume import Checkpoints, Conditions, Keeper, StorageError
 from acmr.run_dir import DIVERGED, RunDir, RunHeldError
@@ -36,7 +37,7 @@ from acmr.snapshots import SnapshotStore
 from acmr.stopping import StopSignals
 from acmr.summary import describe_teacher, reached, summarize
 from acmr.tracking import Tracker, labels, make_tracker
-from acmr.trainer import DivergedError, EpisodeInProgress, Trainer
+from acmr.trainer import DivergedError, Trainer
 
 
 def run_experiment(spec: RunSpec, say: Callable[[str], None] = print) -> dict[str, Any]:

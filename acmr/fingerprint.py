@@ -21,8 +21,8 @@ from acmr.provenance import machine, versions
 _LIBRARIES = ("python", "torch", "numpy", "gymnasium", "mujoco")
 #: Parts of this program that only name, show or send a run; any other part may decide what it computes.
 _ASIDE = frozenset(
-    ("compose", "disk", "evaluation", "heartbeat", "identity", "messages", "mirror", "progress", "provenance",
-     "stopping", "summary", "tracking", "video", "wandb_backend", "features", "__main__")
+    ("camera", "compose", "disk", "evaluation", "heartbeat", "identity", "messages", "mirror", "progress", "provenance",
+     "rollout", "stopping", "summary", "tracking", "video", "wandb_backend", "features", "__main__")
 )  # fmt: skip
 
 

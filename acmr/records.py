@@ -5,13 +5,16 @@ Free of torch, Hydra and W&B, so that the analysis can import it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 #: The first columns of every ``episodes.csv``; a file with only these is complete.
 EPISODE_COLUMNS = ("global_step", "episodic_return", "episode_length")
 #: Further columns, where the environment reports them; ``reward_*`` columns (sums of the reward's terms) follow.
 VELOCITY_COLUMN = "mean_forward_velocity"
+#: What an environment's ``info`` calls its forward velocity, in m/s.
+VELOCITY_KEY = "x_velocity"
 
 #: The paper's experiments: (role of the environment, transfer, freeze) of each (paper, table 2).
 CELLS: dict[str, tuple[str, str, bool]] = {
@@ -42,6 +45,45 @@ class EpisodeRecord:
     episode_length: int
     mean_forward_velocity: float | None = None
     reward_terms: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class EpisodeInProgress:
+    """Sums over the current episode.
+
+    Attributes:
+        terms: Names of the reward's terms that the environment reports with each step.
+        velocity: Whether it reports its forward velocity.
+    """
+
+    terms: tuple[str, ...]
+    velocity: bool
+    length: int = 0
+    total: float = 0.0
+    distance: float = 0.0
+    sums: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Begins the next episode."""
+        self.length, self.total, self.distance = 0, 0.0, 0.0
+        self.sums = dict.fromkeys(self.terms, 0.0)
+
+    def step(self, reward: float, info: Mapping[str, Any]) -> None:
+        """Adds one environment step."""
+        self.length += 1
+        self.total += reward
+        if self.velocity:
+            self.distance += float(info[VELOCITY_KEY])
+        for name in self.terms:
+            self.sums[name] += float(info[name])
+
+    def record(self, global_step: int) -> EpisodeRecord:
+        """The episode, ended at ``global_step``."""
+        velocity = self.distance / self.length if self.velocity else None
+        return EpisodeRecord(global_step, self.total, self.length, velocity, dict(self.sums))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from acmr.segments import BufferFiles
 from acmr.snapshots import Snapshot
 from acmr.trainer import Trainer
 
-#: What :class:`acmr.trainer.EpisodeInProgress` sums up.
+#: What :class:`acmr.records.EpisodeInProgress` sums up.
 _EPISODE = ("length", "total", "distance", "sums")
 #: Parts of :meth:`acmr.sac.SAC.state_dict` that are plain numbers.
 _LEARNER_VALUES = ("metric_sums", "metric_counts")
@@ -34,7 +34,7 @@ class RunState:
     Attributes:
         trainer: With the agent, the buffer, the random streams and the environment.
         warnings: What MuJoCo has warned of.
-            seconds_before: How long the run had taken when this process took it up.
+        seconds_before: How long the run had taken when this process took it up.
     """
 
     trainer: Trainer

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import gymnasium as gym
 import numpy as np
 import torch
 
-from acmr.records import EpisodeRecord
+from acmr.records import EpisodeInProgress, EpisodeRecord
 from acmr.replay_buffer import ReplayBuffer
 from acmr.sac import SAC
 from acmr.seeding import RandomStreams
-
-VELOCITY_KEY = "x_velocity"
 
 
 class DivergedError(Exception):
@@ -31,45 +28,6 @@ class DivergedError(Exception):
     def __init__(self, step: int, cause: str) -> None:
         super().__init__(f"diverged at step {step:,}: {cause}")
         self.step, self.cause = step, cause
-
-
-@dataclass
-class EpisodeInProgress:
-    """Sums over the current episode.
-
-    Attributes:
-        terms: Names of the reward's terms that the environment reports with each step.
-        velocity: Whether it reports its forward velocity.
-    """
-
-    terms: tuple[str, ...]
-    velocity: bool
-    length: int = 0
-    total: float = 0.0
-    distance: float = 0.0
-    sums: dict[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
-        """Begins the next episode."""
-        self.length, self.total, self.distance = 0, 0.0, 0.0
-        self.sums = dict.fromkeys(self.terms, 0.0)
-
-    def step(self, reward: float, info: Mapping[str, Any]) -> None:
-        """Adds one environment step."""
-        self.length += 1
-        self.total += reward
-        if self.velocity:
-            self.distance += float(info[VELOCITY_KEY])
-        for name in self.terms:
-            self.sums[name] += float(info[name])
-
-    def record(self, global_step: int) -> EpisodeRecord:
-        """The episode, ended at ``global_step``."""
-        velocity = self.distance / self.length if self.velocity else None
-        return EpisodeRecord(global_step, self.total, self.length, velocity, dict(self.sums))
 
 
 def _ignore(*_: object) -> None:

@@ -1,121 +1,33 @@
-"""Pictures of an environment, without a screen: one frame, or a film.
-
-MuJoCo robots are drawn by a camera of our own that follows them; other environments draw themselves. The OpenGL
-library is loaded when the first camera is made, so that nothing else depends on there being one.
-"""
+"""Films an environment, at its own speed."""
 
 from __future__ import annotations
 
-import importlib
 import math
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import imageio.v2 as imageio
 import numpy as np
+from PIL import Image
 
+from acmr.camera import Camera, is_robot, make_camera
 from acmr.config import ConfigError
 
-#: What has to be installed on Debian and Ubuntu to draw without a screen.
-GL_PACKAGES = "libegl1 libgl1-mesa-dri"
-#: Frames per second that a film has at most; an environment with more of them is filmed at every n-th step.
-MAX_FPS = 35.0
+#: Files that a film can be, and the frames per second that it has at most: an environment with more of them is filmed
+#: at every n-th step. A GIF holds each frame whole, and has to fit into a page.
+MAX_FPS = {".mp4": 35.0, ".gif": 20.0}
+FILM_SUFFIXES = tuple(MAX_FPS)
+#: Colors of a GIF, and of how many of its frames they are taken.
+_COLORS, _PALETTE_FRAMES = 64, 16
 _ENVIRONMENTS_OWN_FPS = 30.0
 
 
-class Camera(Protocol):
-    """Draws an environment as it is now."""
-
-    def frame(self) -> np.ndarray:
-        """The picture, (height, width, 3), uint8."""
-
-    def close(self) -> None:
-        """Frees what the camera holds."""
-
-
-class RobotCamera:
-    """Follows the robot of a MuJoCo environment.
-
-    Raises:
-        ConfigError: If nothing can be drawn on this machine.
-    """
-
-    def __init__(
-        self, env: gym.Env[Any, Any], width: int, height: int, azimuth: float | None = None, closeness: float = 1.0
-    ) -> None:
-        """Looks at the robot from where Gymnasium does, or from another side (in degrees) and distance."""
-        import mujoco
-
-        robot: Any = env.unwrapped
-        self._mujoco, self._model, self._data = mujoco, robot.model, robot.data
-        size = self._model.vis.global_
-        size.offwidth, size.offheight = max(size.offwidth, width), max(size.offheight, height)
-        self._gl = open_gl(width, height)
-        self._gl.make_current()
-        self._view = mujoco.MjrRect(0, 0, width, height)
-        self._scene = mujoco.MjvScene(self._model, 10_000)
-        self._options, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
-        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        mujoco.mjv_defaultFreeCamera(self._model, self._camera)
-        place = getattr(getattr(robot, "mujoco_renderer", None), "default_cam_config", None) or {}
-        for key in ("distance", "elevation", "azimuth"):
-            if key in place:
-                setattr(self._camera, key, place[key])
-        self._camera.distance *= closeness
-        if azimuth is not None:
-            self._camera.azimuth = azimuth
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-        self._camera.trackbodyid = place.get("trackbodyid", 1)
-
-    def frame(self) -> np.ndarray:
-        """The picture, (height, width, 3), uint8."""
-        mujoco = self._mujoco
-        self._gl.make_current()
-        everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, self._options, None, self._camera, everything, self._scene)
-        mujoco.mjr_render(self._view, self._scene, self._context)
-        picture = np.empty((self._view.height, self._view.width, 3), np.uint8)
-        mujoco.mjr_readPixels(picture, None, self._view, self._context)
-        # OpenGL's rows go up.
-        return np.ascontiguousarray(picture[::-1])
-
-    def close(self) -> None:
-        """Frees the OpenGL context."""
-        self._gl.make_current()
-        self._context.free()
-        self._gl.free()
-
-
-class OwnCamera:
-    """Asks an environment that was made with ``render_mode="rgb_array"``."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        """Remembers the environment."""
-        self._env = env
-
-    def frame(self) -> np.ndarray:
-        """The picture, (height, width, 3), uint8."""
-        name = type(self._env.unwrapped).__name__
-        try:
-            picture = np.asarray(self._env.render())
-        except Exception as error:
-            raise ConfigError(f"{name} cannot draw itself: {' '.join(str(error).split())}") from error
-        if picture.ndim != 3:
-            raise ConfigError(f"{name} draws no pictures")
-        return picture
-
-    def close(self) -> None:
-        """Does nothing: the environment is somebody else's."""
-
-
 class Film:
-    """An mp4 file that runs at the environment's own speed; one that cannot be made costs a line, and no more.
+    """An mp4 or gif file at the environment's own speed; one that cannot be made costs a line, and no more.
 
     Attributes:
         fps: Frames per second.
@@ -127,12 +39,24 @@ class Film:
         env: gym.Env[Any, Any],
         width: int = 480,
         height: int = 480,
+        seconds: float | None = None,
         say: Callable[[str], None] = lambda line: print(line, file=sys.stderr),
     ) -> None:
-        """Makes the camera first: no file is begun where nothing can be drawn."""
+        """Makes the camera first: no file is begun where nothing can be drawn.
+
+        Args:
+            path: The file; its ending says what it is.
+            env: What is filmed.
+            width: In pixels.
+            height: In pixels.
+            seconds: Of simulated time, episode after episode; None: until the first episode ends.
+            say: Where lines for the user go.
+        """
         speed = steps_per_second(env)
-        self._stride = math.ceil(speed / MAX_FPS)
+        self._stride = math.ceil(speed / MAX_FPS[path.suffix])
         self._path, self.fps, self._say = path, speed / self._stride, say
+        self._seconds = seconds
+        self._planned = math.inf if seconds is None else max(1, round(seconds * self.fps))
         self._steps = self._frames = 0
         self._writer: Any = None
         self._camera: Camera | None = None
@@ -144,17 +68,25 @@ class Film:
         if self._camera is not None and self._steps % self._stride == 0:
             with self._costing_a_line():
                 self._write(self._camera.frame())
+            if self._frames >= self._planned:
+                self.close()
         self._steps += 1
 
+    def end_episode(self) -> None:
+        """Ends the film if it was to show one episode."""
+        if self._seconds is None:
+            self.close()
+
     def close(self) -> None:
-        """Ends the file and says where it is."""
+        """Ends the file, if that has not been done, and says where it is."""
         filmed = self._camera is not None and self._writer is not None
         with self._costing_a_line():
             self._end()
             if filmed:
-                self._say(
-                    f"video: {self._path}, {self._frames} frames at {self.fps:.1f} a second, the robot's own pace"
-                )
+                length = f"{self._frames / self.fps:.1f} s"
+                if self._seconds is not None and self._frames < self._planned:
+                    length += f" of the {self._seconds:g} s asked for, for want of more --episodes"
+                self._say(f"video: {self._path}, {self._frames} frames at {self.fps:.1f} a second, {length}")
 
     @contextmanager
     def _costing_a_line(self) -> Iterator[None]:
@@ -176,28 +108,42 @@ class Film:
         if self._writer is None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._path.write_bytes(b"")  # a better error than ffmpeg's
-            self._writer = imageio.get_writer(
-                str(self._path), format="FFMPEG", mode="I", fps=self.fps, quality=7, macro_block_size=2,
-                ffmpeg_log_level="error",
-            )  # fmt: skip
+            self._writer = _open_writer(self._path, self.fps)
         self._writer.append_data(frame)
         self._frames += 1
 
 
-def is_robot(env: gym.Env[Any, Any]) -> bool:
-    """Whether an environment is a MuJoCo simulation."""
-    return hasattr(env.unwrapped, "model") and hasattr(env.unwrapped, "data")
+class GifWriter:
+    """A GIF that repeats for ever, with one small palette for all frames: with its own each frame is twice as large."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        """Remembers the file; it is written when the last frame is known."""
+        self._path, self._duration = path, 1000.0 / fps
+        self._frames: list[np.ndarray] = []
+
+    def append_data(self, frame: np.ndarray) -> None:
+        """Adds a frame, (height, width, 3), uint8."""
+        self._frames.append(frame)
+
+    def close(self) -> None:
+        """Writes the file."""
+        some = self._frames[:: math.ceil(len(self._frames) / _PALETTE_FRAMES)]
+        palette = Image.fromarray(np.concatenate(some)).quantize(_COLORS, method=Image.Quantize.MEDIANCUT)
+        pictures = [
+            Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in self._frames
+        ]
+        # GIF counts in hundredths of a second: what one frame is rounded by, the next ones make up for.
+        ends = np.round(np.arange(len(pictures) + 1) * self._duration / 10) * 10
+        durations = np.diff(ends).astype(int).tolist()
+        pictures[0].save(self._path, save_all=True, append_images=pictures[1:], duration=durations, loop=0)
 
 
-def make_camera(
-    env: gym.Env[Any, Any], width: int, height: int, azimuth: float | None = None, closeness: float = 1.0
-) -> Camera:
-    """A camera for an environment; one that draws itself decides on the size and the view.
-
-    Raises:
-        ConfigError: If nothing can be drawn on this machine.
-    """
-    return RobotCamera(env, width, height, azimuth, closeness) if is_robot(env) else OwnCamera(env)
+def _open_writer(path: Path, fps: float) -> Any:
+    if path.suffix == ".gif":
+        return GifWriter(path, fps)
+    return imageio.get_writer(
+        str(path), format="FFMPEG", mode="I", fps=fps, quality=7, macro_block_size=2, ffmpeg_log_level="error"
+    )
 
 
 def steps_per_second(env: gym.Env[Any, Any]) -> float:
@@ -206,40 +152,3 @@ def steps_per_second(env: gym.Env[Any, Any]) -> float:
     if is_robot(env) and isinstance(interval, float) and interval > 0:
         return 1.0 / interval
     return float(env.metadata.get("render_fps") or _ENVIRONMENTS_OWN_FPS)
-
-
-def open_gl(width: int, height: int) -> Any:
-    """An OpenGL context that draws into memory: MUJOCO_GL's, or EGL's, or that of a screen if there is one.
-
-    Raises:
-        ConfigError: If there is none, with the package that is missing.
-    """
-    chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if chosen in ("egl", "glfw", "osmesa"):
-        backends = [chosen]
-    elif sys.platform == "darwin":
-        backends = ["cgl", "glfw"]
-    else:
-        backends = ["egl", *(["glfw"] if os.environ.get("DISPLAY") else [])]
-    reasons = []
-    for backend in backends:
-        try:
-            return importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
-        except Exception as error:
-            # Each way of not finding a library has its own exception, AttributeError among them.
-            reasons.append(f"{backend}: {' '.join(str(error).split())[:120]}")
-    raise ConfigError(
-        f"no OpenGL library to draw with ({'; '.join(reasons)}); install it with: apt-get install {GL_PACKAGES}, "
-        "and leave MUJOCO_GL unset or set MUJOCO_GL=egl"
-    )
-
-
-@contextmanager
-def without_gl() -> Iterator[None]:
-    """Hides MUJOCO_GL inside: mujoco cannot even be imported where it names a library that is missing."""
-    chosen = os.environ.pop("MUJOCO_GL", None)
-    try:
-        yield
-    finally:
-        if chosen is not None:
-            os.environ["MUJOCO_GL"] = chosen

@@ -17,10 +17,11 @@ from acmr.config import ExperimentConfig
 from acmr.envs import describe, make_env
 from acmr.matmul import choose_products
 from acmr.networks import Dimensions, Networks, is_adapter, is_hidden
+from acmr.records import EpisodeInProgress
 from acmr.replay_buffer import ReplayBuffer
 from acmr.sac import SAC
 from acmr.seeding import random_streams
-from acmr.trainer import EpisodeInProgress, Trainer
+from acmr.trainer import Trainer
 
 Steps = Callable[[int], None]
 LEARNING_STARTS = 300

@@ -10,10 +10,10 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = [
     {"config", "seeding", "records", "durable", "provenance", "heartbeat", "stopping"},
     {"run_dir", "networks", "matmul", "envs", "wandb_backend", "progress"},
-    {"checkpoint", "replay_buffer", "learner", "tracking", "snapshots", "fingerprint"},
+    {"checkpoint", "replay_buffer", "learner", "tracking", "snapshots", "fingerprint", "camera"},
     {"transfer", "sac", "mirror", "video", "segments"},
-    {"trainer", "recorder", "compose", "evaluation", "disk"},
-    {"identity", "messages", "run_state"},
+    {"trainer", "recorder", "compose", "rollout", "disk"},
+    {"identity", "messages", "run_state", "evaluation"},
     {"preparation", "summary", "resume"},
     {"experiment"},
 ]

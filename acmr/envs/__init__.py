@@ -19,6 +19,7 @@ from acmr.config import ConfigError, EnvConfig
 from acmr.envs.construct import cannot_run, construct
 from acmr.envs.features import Probe, probe
 from acmr.envs.wrappers import PartialEnv, kept_rows
+from acmr.records import VELOCITY_KEY
 
 __all__ = ["EnvDescription", "describe", "make_env"]
 
@@ -74,7 +75,7 @@ def describe(config: EnvConfig) -> EnvDescription:
         observation_names=tuple(seen.observation_names[row] for row in sensors),
         action_names=tuple(seen.action_names[row] for row in actuators),
         reward_terms=tuple(key for key in seen.info_keys if key.startswith("reward_")),
-        has_forward_velocity="x_velocity" in seen.info_keys,
+        has_forward_velocity=VELOCITY_KEY in seen.info_keys,
         model_hash=model_hash,
     )
 
