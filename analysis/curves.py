@@ -36,8 +36,8 @@ class FigureData:
         threshold: Return to reach.
         window: Episodes of the rolling average.
         planned: Seeds that a group is planned to have.
-        baselines: Baseline of each group that has one.
         curves: One row for each run and point: ``group, seed, step`` and the rolling averages of ``QUANTITIES``.
+        speeds: One row for each run and point: ``group, run, step, steps_per_second``.
     """
 
     runs: pd.DataFrame
@@ -48,6 +48,7 @@ class FigureData:
     window: int
     planned: int
     curves: pd.DataFrame = field(default_factory=pd.DataFrame)
+    speeds: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     def drawn(self, group: str) -> pd.DataFrame:
         """The runs of a group that are drawn: those that count, or, while there are none, the unfinished ones."""

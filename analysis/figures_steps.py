@@ -72,6 +72,21 @@ def forward_velocity(data: FigureData, palette: Palette) -> Figure | None:
     return _over_steps(data, palette, VELOCITY_COLUMN, "forward velocity (m/s)")
 
 
+def training_speed(data: FigureData, palette: Palette) -> Figure | None:
+    """Environment steps per second of each run over its steps, where they were recorded."""
+    recorded = set(data.speeds["group"])
+    figure, panels = stacked([group for group in data.groups if group in recorded])
+    for axes, groups in panels:
+        for group in groups:
+            own = data.speeds[data.speeds["group"] == group]
+            style = {"color": palette.color(group, data.groups), **marker_style(palette, group, data.groups)}
+            for number, (_, run) in enumerate(own.groupby("run", sort=False)):
+                label = None if number else count_label(data, group)
+                axes.plot(run["step"], run["steps_per_second"], linewidth=0.9, label=label, **style)
+        axes.set(ylabel="steps per second", ylim=(0, 1.1 * float(data.speeds["steps_per_second"].quantile(0.99))))
+    return finish(figure, panels, data)
+
+
 def _over_steps(data: FigureData, palette: Palette, quantity: str, label: str) -> Figure | None:
     recorded = set(data.curves.loc[data.curves[quantity].notna(), "group"])
     figure, panels = stacked([group for group in data.groups if group in recorded])
@@ -117,6 +132,13 @@ FIGURES = (
         "Forward velocity",
         "Rolling averages over {window} episodes. An agent that stands still has a velocity of zero.",
         forward_velocity,
+        limited=True,
+    ),
+    FigureSpec(
+        "training_speed",
+        "Speed",
+        "Environment steps per second of each run once it learns; what else the machine did at the time shows, too.",
+        training_speed,
         limited=True,
     ),
 )

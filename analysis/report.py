@@ -12,13 +12,15 @@ from typing import Any
 import jinja2
 import pandas as pd
 
+from analysis.episodes import EPISODE_FILES
 from analysis.load import RunSet
 from analysis.missing import Missing
 from analysis.published import published_table3
+from analysis.speed import METRICS_FILES
 from analysis.tables import heading, readable
 
 #: Files of a run that are linked where they are there.
-RUN_FILES = ("episodes.csv", "episodes.csv.gz", "config.yaml", "summary.json", "run.log")
+RUN_FILES = (*EPISODE_FILES, *METRICS_FILES, "config.yaml", "summary.json", "run.log")
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from analysis.pipeline import Analysis
 from analysis.published import side_by_side
 from analysis.report import Picture, Report, data_uri, write_report
 from analysis.settings import setting_differences
+from analysis.speed import training_speeds
 from analysis.style import apply
 from analysis.tables import (
     STEPS_COLUMNS,
@@ -148,6 +149,7 @@ def _write_figures(analysis: Analysis, out: Path, options: argparse.Namespace, w
         window=window,
         planned=analysis.planned,
         curves=learning_curves(measured, data.episodes, data.groups, window),
+        speeds=training_speeds(data.root, measured, data.groups),
     )
     made: dict[str, Picture] = {}
     for spec, palette, figure in draw_all(drawing):

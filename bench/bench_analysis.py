@@ -39,6 +39,8 @@ def write_run(root: Path, cell: str, seed: int, episodes: int, total: int, rng: 
     for step, value, length, more in zip(np.cumsum(lengths), returns, lengths, rest.tolist(), strict=True):
         lines.append(f"{step},{float(value)!r},{length},{','.join(map(repr, more))}")
     (directory / "episodes.csv").write_text("\n".join(lines) + "\n")
+    speeds = [f"{step},{110.0 + step % 7}" for step in range(1000, total + 1, 1000)]
+    (directory / "metrics.csv").write_text("\n".join(["global_step,steps_per_second", *speeds]) + "\n")
     common = {"seed": seed, "freeze": freeze, "profile": "paper", "total_timesteps": total, "threshold": 4900.0}
     common["consecutive"] = 5
     agent = {f"setting_{number}": number for number in range(20)} | {"learning_starts": 5000}

@@ -81,6 +81,13 @@ def csv_text(rows: np.ndarray, columns: int = 6) -> str:
     return "\n".join(lines) + "\n"
 
 
+def metrics_text(total: int, speed: float) -> str:
+    """A run that learned at ``speed`` steps per second, after random actions that were much faster."""
+    every = max(1, total // 100)
+    rows = [f"{step},{5000.0 if step <= total // 200 else speed},0.5" for step in range(every, total + 1, every)]
+    return "\n".join(["global_step,steps_per_second,critic_loss", *rows]) + "\n"
+
+
 def write_run(
     root: Path,
     cell: str,
@@ -99,6 +106,7 @@ def write_run(
     config = settings(cell, seed, profile, total, threshold) | more
     (directory / "config.yaml").write_text(yaml.safe_dump(config))
     (directory / "episodes.csv").write_text(csv_text(rows))
+    (directory / "metrics.csv").write_text(metrics_text(total, 110.0 + seed))
     (directory / "run.log").write_text("started\n")
     if summary is not False:
         _, transfer, freeze = CELLS[cell]

@@ -47,9 +47,9 @@ def test_only_what_others_need_is_published(runs, tmp_path):
     names = {
         cell: sorted(path.name for path in run_directory(tmp_path, cell, 1).glob("*")) for cell in ("H0", "A0", "A1")
     }
-    assert names["A0"] == ["config.yaml", "episodes.csv", "summary.json"]
+    assert names["A0"] == ["config.yaml", "episodes.csv", "metrics.csv", "summary.json"]
     assert names["H0"] == [*names["A0"], "teacher.json", "teacher.safetensors"]
-    assert names["A1"] == ["config.yaml", "episodes.csv.gz", "summary.json"]
+    assert names["A1"] == ["config.yaml", "episodes.csv.gz", "metrics.csv", "summary.json"]
     assert not run_directory(tmp_path, "A2", 1).exists()
 
 
