@@ -12,7 +12,6 @@ import torch
 
 from acmr.checkpoint import save_teacher
 from acmr.compose import flatten
-from acmr.config import ConfigError
 from acmr.disk import arrays_bytes, check_space
 from acmr.durable import WriteError
 from acmr.envs import make_env
@@ -20,7 +19,7 @@ from acmr.envs.physics import PhysicsWarnings, no_log_file
 from acmr.envs.state import ANYTIME, NEVER, Rehearsal, rehearse
 from acmr.fingerprint import fingerprint
 from acmr.heartbeat import Heartbeat
-from acmr.identity import RunSpec, differing_keys, is_neutral
+from acmr.identity import RunSpec, holds_run, is_neutral
 from acmr.matmul import Products, choose_products
 from acmr.mirror import replay
 from acmr.preparation import Prepared, prepare
@@ -81,17 +80,8 @@ def exit_code(summary: dict[str, Any]) -> int:
 
 
 def _finished(spec: RunSpec, run_dir: RunDir, say: Callable[[str], None]) -> dict[str, Any] | None:
-    if spec.config.force:
+    if not holds_run(run_dir, spec.config):
         return None
-    stored = run_dir.stored_settings()
-    if stored is None:
-        return None
-    differing = differing_keys(stored, spec.config)
-    if differing:
-        raise ConfigError(
-            f"{run_dir}: holds a run with other settings ({', '.join(differing)}); "
-            "type output_dir=FOLDER for another place, or force=true to replace it"
-        )
     summary = run_dir.summary()
     if summary is not None and summary.get("status") == DIVERGED:
         say(f"{run_dir}: diverged at step {summary.get('step')} ({summary.get('cause')}); force=true runs it anew")

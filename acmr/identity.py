@@ -13,7 +13,7 @@ from typing import Any
 from acmr.compose import as_override, baseline, compose_config, env_overrides, flatten, parse
 from acmr.config import NEUTRAL_KEYS, TEACHER_KEYS, ConfigError, ExperimentConfig
 from acmr.records import CELLS
-from acmr.run_dir import DESCRIPTION_FILE
+from acmr.run_dir import DESCRIPTION_FILE, RunDir
 
 #: Settings that a run's name spells out in its own way.
 _NAMED_KEYS = ("seed", "freeze", "transfer.name", "transfer.teacher", "env.name")
@@ -104,6 +104,24 @@ def differing_keys(stored: Mapping[str, Any], config: ExperimentConfig) -> list[
         # One teacher may be named by several paths; the run's name identifies it by its content.
         if not is_neutral(key) and key != "transfer.teacher" and before.get(key) != now.get(key)
     ]
+
+
+def holds_run(run_dir: RunDir, config: ExperimentConfig) -> bool:
+    """Whether the run that the settings mean has been begun in a directory, and is not to be replaced.
+
+    Raises:
+        ConfigError: If the directory holds a run with other settings.
+    """
+    stored = None if config.force else run_dir.stored_settings()
+    if stored is None:
+        return False
+    differing = differing_keys(stored, config)
+    if differing:
+        raise ConfigError(
+            f"{run_dir}: holds a run with other settings ({', '.join(differing)}); "
+            "type output_dir=FOLDER for another place, or force=true to replace it"
+        )
+    return True
 
 
 def _changes(config: ExperimentConfig) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from acmr.compose import compose_config, parse
 from acmr.config import ConfigError, ExperimentConfig
-from acmr.identity import RunSpec, differing_keys, specify, teacher_spec
+from acmr.identity import RunSpec, holds_run, specify, teacher_spec
 from acmr.messages import check_booleans
 from acmr.run_dir import RunDir
 from sweeps.folder import COMPLETE, DIVERGED
@@ -145,15 +145,8 @@ def _teacher(config: ExperimentConfig) -> RunSpec | None:
 
 def _ended(spec: RunSpec) -> str | None:
     run_dir = RunDir(spec.directory)
-    stored = None if spec.config.force else run_dir.stored_settings()
-    if stored is None:
+    if not holds_run(run_dir, spec.config):
         return None
-    differing = differing_keys(stored, spec.config)
-    if differing:
-        raise ConfigError(
-            f"{run_dir}: holds a run with other settings ({', '.join(differing)}); "
-            "type output_dir=FOLDER for another place, or force=true to replace it"
-        )
     status = (run_dir.summary() or {}).get("status")
     return str(status) if status in (COMPLETE, DIVERGED) else None
 

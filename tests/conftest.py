@@ -48,3 +48,18 @@ def teacher_factory(tmp_path: Path) -> Callable[..., Teacher]:
         return load_teacher(folder)
 
     return make
+
+
+@pytest.fixture(scope="module")
+def untouched(tmp_path_factory: pytest.TempPathFactory) -> Callable[[tuple[str, ...]], dict[str, bytes]]:
+    """What undisturbed runs leave."""
+    from torture import Run  # here, so that tests of other things need not load the whole program
+
+    made: dict[tuple[str, ...], dict[str, bytes]] = {}
+
+    def of(overrides: tuple[str, ...]) -> dict[str, bytes]:
+        if overrides not in made:
+            made[overrides] = Run(tmp_path_factory.mktemp("untouched"), overrides).finish()
+        return dict(made[overrides])
+
+    return of

@@ -20,19 +20,6 @@ from acmr.envs.physics import PhysicsWarnings
 ROOT = Path(__file__).resolve().parent.parent
 
 
-@pytest.fixture(scope="module")
-def untouched(tmp_path_factory):
-    """What undisturbed runs leave."""
-    made = {}
-
-    def of(overrides: tuple[str, ...]) -> dict[str, bytes]:
-        if overrides not in made:
-            made[overrides] = Run(tmp_path_factory.mktemp("untouched"), overrides).finish()
-        return dict(made[overrides])
-
-    return of
-
-
 @pytest.mark.parametrize(
     ("number", "name", "code"),
     [(signal.SIGTERM, "SIGTERM", 143), (signal.SIGINT, "Ctrl-C", 130), (signal.SIGHUP, "SIGHUP", 129)],

@@ -17,19 +17,6 @@ from torture import ANT, SHORT, Run, at_step, at_write, count_writes, fail_with,
 ROOT = Path(__file__).resolve().parent.parent
 
 
-@pytest.fixture(scope="module")
-def untouched(tmp_path_factory):
-    """What undisturbed runs leave."""
-    made = {}
-
-    def of(overrides: tuple[str, ...]) -> dict[str, bytes]:
-        if overrides not in made:
-            made[overrides] = Run(tmp_path_factory.mktemp("untouched"), overrides).finish()
-        return dict(made[overrides])
-
-    return of
-
-
 def error_of(said: str) -> str:
     (line,) = [line for line in said.splitlines() if line.startswith("error: ")]
     assert "Traceback" not in said
