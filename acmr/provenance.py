@@ -47,9 +47,13 @@ def machine(threads: int, device: str) -> dict[str, str | int]:
 
 
 def _processor() -> str:
+    """The processor's name; with family and model, where it has them, for hypervisors shorten the name."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
-        return platform.processor() or "unknown"
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or "unknown"
+        lines = []
+    # Of several processors the first: its entries come last here.
+    said = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
+    name = said.get("model name") or platform.processor() or "unknown"
+    kind = [f"{key.split()[-1]} {said[key]}" for key in ("cpu family", "model") if key in said]
+    return f"{name} ({', '.join(kind)})" if kind else name
