@@ -1,0 +1,92 @@
+"""The runs in results/paper: whole, made with the settings that their cells have now, and of use to others."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from safetensors.numpy import load_file
+
+from acmr.compose import compose_config, parse
+from acmr.identity import differing_keys
+from analysis.load import load
+from analysis.pipeline import analyze
+
+ROOT = Path(__file__).resolve().parent.parent
+PUBLISHED = ROOT / "results" / "paper"
+TEACHER = PUBLISHED / "humanoid-none" / "seed_1"
+RUNS = sorted(path.parent for path in PUBLISHED.glob("*/*/summary.json"))
+
+
+def summary_of(run: Path) -> dict:
+    return json.loads((run / "summary.json").read_text())
+
+
+def test_they_are_analyzed_without_a_remark():
+    measured = analyze(load(PUBLISHED)).measured
+    assert len(measured) == len(RUNS) >= 2
+    assert set(measured["state"]) == {"complete"}
+    # Among others: the steps to threshold in a summary are those of the episodes beside it.
+    assert set(measured["reason"]) == {""}
+
+
+@pytest.mark.parametrize("run", RUNS, ids=lambda run: f"{run.parent.name}-{run.name}")
+def test_each_is_the_papers_cell(run):
+    summary = summary_of(run)
+    assert summary["global_step"] == summary["total_timesteps"] == 1_000_000
+    assert summary["profile"] == "paper"
+    assert not summary["git_commit"].endswith("-dirty")
+    meant = parse(compose_config([f"experiment={summary['cell']}", f"seed={summary['seed']}"]))
+    assert differing_keys(yaml.safe_load((run / "config.yaml").read_text()), meant) == []
+    assert str(ROOT) not in "".join(path.read_text() for path in run.glob("*.[jy]*"))
+
+
+@pytest.mark.parametrize("run", RUNS, ids=lambda run: f"{run.parent.name}-{run.name}")
+def test_the_page_of_results_tells_the_same(run):
+    summary = summary_of(run)
+    page = (ROOT / "docs" / "results.md").read_text().splitlines()
+    rows = [line for line in page if line.startswith(f"| {summary['cell']} | {summary['seed']} |")]
+    assert rows, "docs/results.md has no row for this run"
+    steps = summary["steps_to_threshold"]
+    for told in (
+        f"{steps:,}" if steps else "not reached",
+        f"{summary['episodes']:,}",
+        f"{summary['final_return']:,.0f}",
+        f"{summary['steps_per_second']:.0f}",
+    ):
+        assert f" {told} |" in rows[0], told
+
+
+def test_a_student_learns_from_the_published_teacher(tmp_path):
+    command = [sys.executable, "run.py", "experiment=A2", f"transfer.teacher={TEACHER.relative_to(ROOT)}"]
+    command += ["total_timesteps=60", "agent.learning_starts=40", "agent.buffer_size=60", "agent.batch_size=8"]
+    command += [f"output_dir={tmp_path}", "tracking=off"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, env=dict(os.environ))
+    assert done.returncode == 0, done.stdout + done.stderr
+    (folder,) = tmp_path.glob("paper/*/seed_1")
+    assert "hidden-frozen" in folder.parent.name
+    copied = json.loads((folder / "transfer.json").read_text())["copied"]
+    assert len(copied) == 3
+    teacher, student = load_file(TEACHER / "teacher.safetensors"), load_file(folder / "teacher.safetensors")
+    # The copied layers are frozen: after 20 updates they still are the teacher's, bit for bit, and the others moved.
+    for layer in copied:
+        for name in (f"{layer}.weight", f"{layer}.bias"):
+            assert student[name].tobytes() == teacher[name].tobytes(), name
+    assert np.isfinite(student["actor.mean.weight"]).all()
+
+
+def test_the_published_runs_are_taken_up_by_the_matrix(tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "paper").symlink_to(PUBLISHED)
+    command = [sys.executable, str(ROOT / "run.py"), "matrix=paper", "plan=true", f"output_dir={tmp_path / 'runs'}"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, env=dict(os.environ))
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = done.stdout.splitlines()
+    assert sum(line.startswith("complete ") for line in lines) == len(RUNS)
+    assert sum("seed" in line and not line.startswith("complete ") for line in lines) == 21 - len(RUNS)
