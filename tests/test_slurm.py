@@ -119,7 +119,7 @@ def test_ctrl_c_takes_the_jobs_out_of_the_queue_and_the_same_command_goes_on(clu
 @pytest.mark.slow
 def test_a_job_that_has_to_leave_its_node_goes_on_from_its_checkpoint(cluster, tmp_path):
     out = tmp_path / "runs"
-    words = ["-m", "profile=quick", "experiment=A0", *TINY, "total_timesteps=6000", "agent.learning_starts=100"]
+    words = ["-m", "profile=quick", "experiment=A0", *TINY, "total_timesteps=8000", "agent.learning_starts=100"]
     sweep = start(out, *words)
 
     def learning() -> bool:
@@ -140,7 +140,7 @@ def test_a_job_that_has_to_leave_its_node_goes_on_from_its_checkpoint(cluster, t
 @pytest.mark.slow
 def test_jobs_of_a_sweep_that_was_killed_make_room_for_the_next(cluster, tmp_path):
     out = tmp_path / "runs"
-    words = ["-m", "profile=quick", "experiment=A0", "seed=1,2", *TINY, "total_timesteps=3000"]
+    words = ["-m", "profile=quick", "experiment=A0", "seed=1,2", *TINY, "total_timesteps=8000"]
     sweep = start(out, *words)
     await_that(lambda: len(list(out.glob("*/*/*/status.json"))) == 2)
     sweep.kill()
