@@ -7,7 +7,6 @@ import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from acmr.config import ExperimentConfig
 from acmr.envs import describe
@@ -18,6 +17,8 @@ from sweeps.plan import Plan, PlannedRun
 _BASE_MEMORY = 450e6
 #: Disk of a finished run where none of its kind is there to look at: results, networks and mirror, an upper limit.
 _RESULT_DISK = 20e6
+#: Profile and name of runs that differ in the seed only: they are equally fast.
+_Kind = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ class Estimate:
 def estimate(plan: Plan, output_dir: Path, workers: int) -> Estimate:
     """Works out what the missing runs of a plan need when ``workers`` are trained at a time."""
     speeds = _speeds(output_dir)
-    seconds = {run.index: _seconds(run, speeds) for run in plan.missing}
+    models = {run.index: _models(run, speeds) for run in plan.missing}
+    seconds = {run.index: _seconds(run, [speeds[name] for name in models[run.index]]) for run in plan.missing}
     buffers = sorted((_buffer_bytes(run.spec.config) for run in plan.missing), key=lambda size: -(size or 0))
     largest = buffers[:workers]
     known = [size for size in largest if size is not None]
@@ -52,16 +54,16 @@ def estimate(plan: Plan, output_dir: Path, workers: int) -> Estimate:
         seconds=_makespan(plan, {index: time for index, time in seconds.items() if time is not None}, workers)
         if all(time is not None for time in seconds.values())
         else None,
-        measured_on=sum(len(values) for values in speeds.values()),
+        measured_on=sum(len(speeds[name]) for name in set[_Kind]().union(*models.values())),
         memory=sum(known) + _BASE_MEMORY * len(largest) if complete else None,
         disk=sum(known) * 1.1 + kept if complete else None,
         kept=kept,
     )
 
 
-def _speeds(output_dir: Path) -> dict[tuple[Any, ...], list[float]]:
-    """Steps per second of finished runs, by what makes runs equally fast; in part, too, for want of better."""
-    found: dict[tuple[Any, ...], list[float]] = {}
+def _speeds(output_dir: Path) -> dict[_Kind, list[float]]:
+    """Steps per second of finished runs, by profile and name."""
+    found: dict[_Kind, list[float]] = {}
     for path in output_dir.glob("*/*/seed_*/summary.json"):
         try:
             summary = json.loads(path.read_text(encoding="utf-8"))
@@ -73,12 +75,15 @@ def _speeds(output_dir: Path) -> dict[tuple[Any, ...], list[float]]:
     return found
 
 
-def _seconds(run: PlannedRun, speeds: dict[tuple[Any, ...], list[float]]) -> float | None:
-    config = run.spec.config
-    same = speeds.get((config.profile, run.spec.name))
-    alike = [speed for (profile, _), values in speeds.items() if profile == config.profile for speed in values]
-    values = same or alike
-    return config.total_timesteps / statistics.fmean(values) if values else None
+def _models(run: PlannedRun, speeds: dict[_Kind, list[float]]) -> list[_Kind]:
+    """Whose speed a run is expected to have: its own with other seeds, else for want of better its whole profile."""
+    profile, same = run.spec.config.profile, (run.spec.config.profile, run.spec.name)
+    return [same] if same in speeds else [kind for kind in speeds if kind[0] == profile]
+
+
+def _seconds(run: PlannedRun, speeds: list[list[float]]) -> float | None:
+    values = [speed for of_kind in speeds for speed in of_kind]
+    return run.spec.config.total_timesteps / statistics.fmean(values) if values else None
 
 
 def _makespan(plan: Plan, seconds: dict[int, float], workers: int) -> float:

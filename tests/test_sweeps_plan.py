@@ -222,6 +222,13 @@ def test_the_time_needed_comes_from_finished_runs(tmp_path, out):
     assert needs.seconds == pytest.approx(200)
     assert estimate(plan(*jobs), tmp_path, 1).seconds == pytest.approx(400)
     assert estimate(plan(*jobs), tmp_path, 4).seconds == pytest.approx(200)
+    # Runs of another profile are no model; those that differ in the seed only are the best one.
+    finish(expand([[common[0], "experiment=A0"]])[0], speed=1.0)
+    assert estimate(plan(*jobs), tmp_path, 2) == needs
+    for seed in (4, 5):
+        finish(expand([[*common, "experiment=H0", f"seed={seed}"]])[0], speed=20.0)
+    some = estimate(plan([*common, "experiment=H0", "seed=1"]), tmp_path, 1)
+    assert (some.seconds, some.measured_on) == (pytest.approx(50), 2)
     row = 4 * (27 + 8 + 3)
     assert needs.memory == pytest.approx(2 * (450e6 + row * 1000), rel=0.01)
 
