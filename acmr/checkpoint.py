@@ -142,8 +142,12 @@ def load_teacher(path: str | Path) -> Teacher:
     Raises:
         ConfigError: If a file is missing, damaged, of another format, or not what its description says.
     """
-    path = locate_teacher(path)
+    given, path = Path(path), locate_teacher(path)
     beside = path.with_suffix(".json")
+    if given.is_dir() and not path.exists():
+        raise ConfigError(
+            f"{given}: no {TENSOR_FILE} in it; a run writes it at its end, and of published runs only H0 has it"
+        )
     if not path.is_file():
         raise ConfigError(f"{path}: no such teacher file; give a finished run's directory or its {TENSOR_FILE}")
     if not beside.is_file():

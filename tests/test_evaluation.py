@@ -112,7 +112,7 @@ def spoil(run_dir: Path, what: str) -> Path:
         ("unfinished", "not finished"),
         ("diverged", "not finished"),
         ("damaged teacher", "damaged or exchanged"),
-        ("no teacher", "no such teacher file"),
+        ("no teacher", "no teacher.safetensors in it"),
         ("damaged config", "not readable"),
         ("config without env", "config.yaml: damaged"),
         ("unknown setting", "gravity"),
