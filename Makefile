@@ -66,10 +66,10 @@ publish: $(READY) ## add the finished runs of PROFILE to results/, without what 
 	@python -m analysis.publish $(RUNS)/$(PROFILE) results/$(PROFILE)
 
 dashboard: $(READY) ## browse all runs in the terminal, offline
-	python -m acmr.mirror dashboard $(RUNS)/wandb
+	python -m acmr.tracking.mirror dashboard $(RUNS)/wandb
 
 sync: $(READY) ## send offline runs to a W&B server: make sync BASE_URL=http://HOST:PORT
-	python -m acmr.mirror sync --base-url "$(BASE_URL)" $(RUNS)/wandb
+	python -m acmr.tracking.mirror sync --base-url "$(BASE_URL)" $(RUNS)/wandb
 
 bench: $(READY) ## our learner beside Stable-Baselines3 and SBX, and beside what the core can do
 	python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'

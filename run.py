@@ -19,9 +19,9 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from acmr.compose import parse, register_schema
-from acmr.identity import RunSpec, specify
-from acmr.messages import USER_ERRORS, check_booleans, explain, quote_paths
+from acmr.settings.compose import parse, register_schema
+from acmr.settings.errors import USER_ERRORS, check_booleans, explain, quote_paths
+from acmr.settings.run_spec import RunSpec, specify
 
 #: Words of a sweep, and where Hydra keeps them: they are no settings of a run.
 SWEEP_WORDS = {"plan": "hydra.sweeper.plan", "retries": "hydra.sweeper.retries", "workers": "hydra.launcher.n_jobs"}
@@ -45,7 +45,7 @@ def train(cfg: DictConfig) -> None:
 
 def _run(spec: RunSpec) -> None:
     # Here, so that a wrong setting is refused without waiting for torch and MuJoCo to load.
-    from acmr.experiment import exit_code, run_experiment
+    from acmr.run.experiment import exit_code, run_experiment
 
     if code := exit_code(run_experiment(spec)):
         sys.exit(code)

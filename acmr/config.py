@@ -1,13 +1,14 @@
 """The settings of one run: their types, and what makes them valid.
 
 Values live in ``conf/``; this module gives them types and checks them once, before anything is created.
-Nothing here knows where a value came from (see :mod:`acmr.compose` for that).
+Nothing here knows where a value came from (see :mod:`acmr.settings.compose` for that).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 #: Settings that cannot change what a run computes: they are no part of a run's name.
@@ -219,3 +220,31 @@ def _within(key: str, value: float, *, low: float, high: float, low_open: bool =
 def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         raise ConfigError(f"{key}={value}: must be one of {', '.join(allowed)}")
+
+
+def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as ``{"agent.q_lr": 0.001, ...}``; lists are values."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flatten(value, f"{prefix}{key}.")
+        elif not isinstance(value, Mapping):
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def is_neutral(key: str) -> bool:
+    """Whether a setting cannot change what a run computes."""
+    return key.split(".")[0] in NEUTRAL_KEYS
+
+
+def differing_keys(stored: Mapping[str, Any], config: ExperimentConfig) -> list[str]:
+    """Settings, of those that change the result, in which a stored run differs from this one."""
+    before, now = flatten(stored), flatten(asdict(config))
+    keys = sorted(set(before) | set(now))
+    return [
+        key
+        for key in keys
+        # One teacher may be named by several paths; the run's name identifies it by its content.
+        if not is_neutral(key) and key != "transfer.teacher" and before.get(key) != now.get(key)
+    ]

@@ -9,6 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+#: States of a run that has ended, as ``summary.json`` names them.
+COMPLETE, DIVERGED = "complete", "diverged"
+#: The final networks of a run, and their description.
+TENSOR_FILE, DESCRIPTION_FILE = "teacher.safetensors", "teacher.json"
 #: The first columns of every ``episodes.csv``; a file with only these is complete.
 EPISODE_COLUMNS = ("global_step", "episodic_return", "episode_length")
 #: Further columns, where the environment reports them; ``reward_*`` columns (sums of the reward's terms) follow.

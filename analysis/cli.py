@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     # Only now, so that --help and typing errors need not wait for pandas and scipy.
-    from analysis.load import InputError
+    from analysis.loading.load import InputError
     from analysis.pipeline import run
 
     try:

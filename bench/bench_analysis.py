@@ -18,8 +18,8 @@ import numpy as np
 import yaml
 
 from acmr.records import CELLS
-from analysis.load import load
-from analysis.metrics import measure
+from analysis.loading.load import load
+from analysis.statistics.metrics import measure
 
 LOAD_LIMIT, RESULTS_LIMIT = 10.0, 60.0
 TERMS = ("reward_forward", "reward_survive", "reward_ctrl")

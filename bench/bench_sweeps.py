@@ -15,7 +15,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from acmr.run_dir import RunDir
+from acmr.storage.run_dir import RunDir
 from sweeps.folder import SweepFolder
 from sweeps.plan import Plan, expand, make_plan
 from sweeps.sweeper import entries_of

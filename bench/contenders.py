@@ -12,16 +12,16 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from acmr.compose import compose_config, parse
+from acmr.agent.networks import Dimensions, Networks, is_adapter, is_hidden
+from acmr.agent.precision import choose_products
+from acmr.agent.replay_buffer import ReplayBuffer
+from acmr.agent.sac import SAC
 from acmr.config import ExperimentConfig
 from acmr.envs import describe, make_env
-from acmr.matmul import choose_products
-from acmr.networks import Dimensions, Networks, is_adapter, is_hidden
 from acmr.records import EpisodeInProgress
-from acmr.replay_buffer import ReplayBuffer
-from acmr.sac import SAC
-from acmr.seeding import random_streams
-from acmr.trainer import Trainer
+from acmr.run.random_streams import random_streams
+from acmr.run.trainer import Trainer
+from acmr.settings.compose import compose_config, parse
 
 Steps = Callable[[int], None]
 LEARNING_STARTS = 300

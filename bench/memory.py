@@ -9,11 +9,11 @@ import sys
 import numpy as np
 import torch
 
+from acmr.agent.networks import Dimensions
+from acmr.agent.precision import choose_products
+from acmr.agent.replay_buffer import ReplayBuffer
+from acmr.agent.sac import SAC
 from acmr.config import SACConfig
-from acmr.matmul import choose_products
-from acmr.networks import Dimensions
-from acmr.replay_buffer import ReplayBuffer
-from acmr.sac import SAC
 from bench import contenders
 
 TARGET_GB = 2.2

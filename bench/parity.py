@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.statistics import permutation_p, t_test
-from analysis.survival import log_rank
+from analysis.statistics.survival import log_rank
+from analysis.statistics.two_samples import permutation_p, t_test
 
 
 def steps_to_threshold(folder: Path) -> dict[int, tuple[float, bool]]:

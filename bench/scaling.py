@@ -10,7 +10,7 @@ import time
 import numpy as np
 import torch
 
-from acmr.networks import Dimensions, Networks
+from acmr.agent.networks import Dimensions, Networks
 from bench import updates, work
 
 BASE = {"batch": 256, "width": 256, "observation": 376}

@@ -58,8 +58,8 @@ def measure(rounds: int, steps: int) -> dict[str, Any]:
     """Takes turns; returns seconds a step of every contender and round, and the work that a step is."""
     import torch
 
-    from acmr.matmul import use_fast_float32
-    from acmr.networks import Dimensions
+    from acmr.agent.networks import Dimensions
+    from acmr.agent.precision import use_fast_float32
     from bench import contenders, updates, work
 
     source, target = Dimensions(376, 17), Dimensions(270, 11)
@@ -200,7 +200,7 @@ def table(result: dict[str, Any]) -> list[str]:
 
 
 def _machine(core: int) -> dict[str, Any]:
-    from acmr.provenance import machine, versions
+    from acmr.run.reproducibility import machine, versions
 
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     about = {"core": core, "cores": os.cpu_count(), "load": load, "python": platform.python_version()}

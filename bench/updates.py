@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from acmr.agent.networks import Networks
+from acmr.agent.precision import choose_products
+from acmr.agent.replay_buffer import ReplayBuffer
+from acmr.agent.sac import SAC
 from acmr.config import SACConfig
-from acmr.matmul import choose_products
-from acmr.networks import Networks
-from acmr.replay_buffer import ReplayBuffer
-from acmr.sac import SAC
 
 TWINS = ("A1", "A2", "A3", "A4")
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from acmr.networks import Networks, Trunk
+from acmr.agent.networks import Networks, Trunk
 
 #: Optimizer, target update: bytes read and written for each parameter that learns (values, gradient, two moments).
 ADAM_BYTES, POLYAK_BYTES = 4 * 7, 4 * 3

@@ -77,7 +77,7 @@ class FixedConfigs(ConfigLoader):
         raise NotImplementedError
 
 
-class Engine:
+class LauncherAdapter:
     """Runs jobs on this machine, as many at a time as there are workers; each takes up the next run that can start.
 
     Args:
@@ -87,7 +87,7 @@ class Engine:
     """
 
     #: Whether a job may choose its run, so that no worker idles at the border of two stages.
-    chooses = True
+    workers_pick_runs = True
 
     def __init__(self, config: DictConfig, context: HydraContext, threads: int) -> None:
         self._config, self._context = copy.deepcopy(config), context
@@ -153,10 +153,10 @@ class Engine:
         """Ends the jobs of the last launch; here the workers do that themselves."""
 
 
-class SlurmEngine(Engine):
+class SlurmAdapter(LauncherAdapter):
     """Runs jobs on a cluster, one for each run; a job is not spent on waiting, so stages follow one another."""
 
-    chooses = False
+    workers_pick_runs = False
 
     def __init__(self, config: DictConfig, context: HydraContext, threads: int) -> None:
         super().__init__(config, context, threads)
@@ -209,8 +209,8 @@ class SlurmEngine(Engine):
         subprocess.run(["scancel", f"--name={self._name}"], capture_output=True, check=False, timeout=60)
 
 
-def make_engine(config: DictConfig, context: HydraContext, threads: int) -> Engine:
+def make_engine(config: DictConfig, context: HydraContext, threads: int) -> LauncherAdapter:
     """The engine for the launcher that was chosen."""
     target = str(OmegaConf.select(config, "hydra.launcher._target_"))
-    kind = SlurmEngine if target.endswith("SlurmLauncher") else Engine
+    kind = SlurmAdapter if target.endswith("SlurmLauncher") else LauncherAdapter
     return kind(config, context, threads)

@@ -27,7 +27,7 @@ _KEPT = 10
 
 
 @dataclass(frozen=True)
-class Entry:
+class SweepRun:
     """One run, as the sweep's folder knows it.
 
     Attributes:
@@ -84,7 +84,7 @@ class SweepFolder:
 
     @classmethod
     def create(
-        cls, output_dir: Path, header: Mapping[str, Any], entries: Sequence[Entry], order: Sequence[int], conf: Path
+        cls, output_dir: Path, header: Mapping[str, Any], entries: Sequence[SweepRun], order: Sequence[int], conf: Path
     ) -> SweepFolder:
         """Makes the folder of a new sweep, and clears away those of sweeps long gone.
 
@@ -119,9 +119,9 @@ class SweepFolder:
         assert isinstance(content, dict)
         return content
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[SweepRun]:
         """All runs of the sweep."""
-        return [Entry(**run) for run in self.header()["runs"]]
+        return [SweepRun(**run) for run in self.header()["runs"]]
 
     def is_alive(self) -> bool:
         """Whether its process is still there."""

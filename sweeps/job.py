@@ -17,9 +17,9 @@ from typing import IO
 
 from omegaconf import OmegaConf
 
-from acmr import compose
 from acmr.config import ExperimentConfig
-from acmr.identity import RunSpec
+from acmr.settings import compose
+from acmr.settings.run_spec import RunSpec
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 #: Environment variable with the process that a training must not outlive.
@@ -64,7 +64,7 @@ def adopt(path: Path) -> RunSpec:
     return spec
 
 
-class Training:
+class TrainingProcess:
     """A run's own process.
 
     Args:

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Sequence
 
-from sweeps.engine import Engine
+from sweeps.engine import LauncherAdapter
 from sweeps.folder import SweepFolder
 
 #: Seconds between two questions to a cluster's queue, and how often in a row it has to say that nothing is left.
@@ -26,7 +26,7 @@ class Launch:
         error: What the launcher raised, if it did.
     """
 
-    def __init__(self, engine: Engine, folder: SweepFolder, runs: Sequence[int], number: int) -> None:
+    def __init__(self, engine: LauncherAdapter, folder: SweepFolder, runs: Sequence[int], number: int) -> None:
         self.error: BaseException | None = None
         self._engine = engine
         self._interval, self._asked, self._seen, self._empty = _QUEUE_INTERVAL, time.monotonic(), False, 0
@@ -41,7 +41,7 @@ class Launch:
     def is_over(self, seconds: float) -> bool:
         """Whether no job is left, after waiting for so many seconds at most."""
         self._thread.join(seconds)
-        if self._engine.chooses or (self.error is None and not self.is_waiting):
+        if self._engine.workers_pick_runs or (self.error is None and not self.is_waiting):
             return not self.is_waiting
         # The cluster's queue knows: submitit gives up all jobs at the first that fails, and takes ten minutes to
         # notice one that was killed, or for ever where the cluster keeps no accounts.

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
-from acmr.compose import compose_config, parse
 from acmr.config import ConfigError, ExperimentConfig
-from acmr.identity import RunSpec, holds_run, specify, teacher_spec
-from acmr.messages import check_booleans
-from acmr.run_dir import RunDir
+from acmr.settings.compose import compose_config, parse
+from acmr.settings.errors import check_booleans
+from acmr.settings.run_spec import RunSpec, specify, teacher_spec
+from acmr.storage.run_dir import RunDir, holds_run
 from sweeps.folder import COMPLETE, DIVERGED
 
 #: Settings that a teacher takes over from its student because they change nothing in its result.

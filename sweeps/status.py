@@ -10,14 +10,14 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sweeps.folder import FAILED, FINAL, RUNNING, WAITING, Entry, State, SweepFolder, all_folders
-from sweeps.view import BLOCKED, LOST, RunView, counts, span, table, view_entries, view_run
+from sweeps.folder import FAILED, FINAL, RUNNING, WAITING, State, SweepFolder, SweepRun, all_folders
+from sweeps.view import BLOCKED, LOST, RunStatus, counts, span, table, view_entries, view_run
 
 #: States for which somebody has to do something.
 _BAD = (FAILED, LOST, BLOCKED)
 
 
-def all_runs(output_dir: Path) -> list[RunView]:
+def all_runs(output_dir: Path) -> list[RunStatus]:
     """Every run below a folder, and those that its latest sweep has not begun yet."""
     planned = _planned(output_dir)
     found = {path.parent for name in ("config.yaml", "status.json") for path in output_dir.glob(f"*/*/seed_*/{name}")}
@@ -27,9 +27,9 @@ def all_runs(output_dir: Path) -> list[RunView]:
     return sorted(views.values(), key=lambda view: (view.directory.parts[:-1], view.seed))
 
 
-def _planned(output_dir: Path) -> list[RunView]:
+def _planned(output_dir: Path) -> list[RunStatus]:
     folders = all_folders(output_dir)
-    known: dict[Path, RunView] = {}
+    known: dict[Path, RunStatus] = {}
     for folder in folders:
         entries = folder.entries()
         alive = folder.is_alive()
@@ -40,14 +40,14 @@ def _planned(output_dir: Path) -> list[RunView]:
     return list(known.values())
 
 
-def _state(folder: SweepFolder, entry: Entry, alive: bool) -> State:
+def _state(folder: SweepFolder, entry: SweepRun, alive: bool) -> State:
     state = folder.state(entry.index)
     if state.state == RUNNING and not alive:
         return State()
     return state
 
 
-def _with_profile(view: RunView) -> RunView:
+def _with_profile(view: RunStatus) -> RunStatus:
     return replace(view, name=f"{view.directory.parts[-3]}/{view.directory.parts[-2]}")
 
 

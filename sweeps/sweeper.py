@@ -16,12 +16,12 @@ from types import FrameType
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
-from acmr.compose import CONFIG_FOLDER
 from acmr.config import ConfigError
-from sweeps.board import Board, print_plan
-from sweeps.engine import Engine, make_engine
+from acmr.settings.compose import CONFIG_FOLDER
+from sweeps.display import Display, print_plan
+from sweeps.engine import LauncherAdapter, make_engine
 from sweeps.estimate import estimate
-from sweeps.folder import COMPLETE, FAILED, FINAL, RUNNING, STOPPED, Entry, State, SweepFolder, all_folders
+from sweeps.folder import COMPLETE, FAILED, FINAL, RUNNING, STOPPED, State, SweepFolder, SweepRun, all_folders
 from sweeps.job import STOP_SIGNALS, write_job
 from sweeps.launch import Launch
 from sweeps.plan import Plan, expand, make_plan
@@ -87,7 +87,7 @@ class Sweep:
         engine: What runs the jobs.
     """
 
-    def __init__(self, plan: Plan, output_dir: Path, settings: Settings, engine: Engine) -> None:
+    def __init__(self, plan: Plan, output_dir: Path, settings: Settings, engine: LauncherAdapter) -> None:
         self._plan, self._settings, self._engine = plan, settings, engine
         header = {
             # As it was typed, not as Hydra got it.
@@ -115,7 +115,7 @@ class Sweep:
         # Who started this in the background may have chosen that some do not reach it.
         wanted = [each for each in STOP_SIGNALS if signal.getsignal(each) is not signal.SIG_IGN]
         before = {each: signal.signal(each, self._note) for each in wanted}
-        board = Board(self._folder, self._entries, self._output_dir)
+        board = Display(self._folder, self._entries, self._output_dir)
         try:
             self._launch_all(board)
         finally:
@@ -135,7 +135,7 @@ class Sweep:
         with suppress(OSError):
             self._folder.stop(at_once=again)
 
-    def _launch_all(self, board: Board) -> None:
+    def _launch_all(self, board: Display) -> None:
         number = fruitless = 0
         while self._signal is None and (runs := self._to_launch()):
             before = [self._state(index) for index in runs]
@@ -152,7 +152,7 @@ class Sweep:
                 board.say(f"error: the launcher starts no jobs; {_line(launch.error)}")
                 return
 
-    def _await(self, launch: Launch, board: Board) -> None:
+    def _await(self, launch: Launch, board: Display) -> None:
         deadline, quiet = float("inf"), 0
         while not launch.is_over(_GLANCE):
             board.tick()
@@ -163,7 +163,7 @@ class Sweep:
                 board.say("stopping: the trainings write their checkpoints (once more to end them at once)")
                 launch.cancel()
             # Hundreds of runs may still wait in the workers' queue; handing them out to nobody takes long.
-            quiet = quiet + 1 if self._engine.chooses and not self._is_training() else 0
+            quiet = quiet + 1 if self._engine.workers_pick_runs and not self._is_training() else 0
             if quiet > 2 or time.monotonic() > deadline:
                 break
         self._abandoned = self._abandoned or launch.is_waiting
@@ -181,7 +181,7 @@ class Sweep:
         for index in self._plan.order:
             teacher = self._entries[index].teacher
             taught = COMPLETE if teacher is None else self._state(teacher).state
-            possible = taught == COMPLETE or (self._engine.chooses and taught not in FINAL)
+            possible = taught == COMPLETE or (self._engine.workers_pick_runs and taught not in FINAL)
             if self._state(index).state not in FINAL and possible:
                 found.append(index)
         return found
@@ -192,11 +192,11 @@ class Sweep:
             state = self._folder.state(index)
             if state.state == RUNNING:
                 # On this machine one lost worker takes its siblings along, so that it is no fault of the run.
-                failures = state.failures + (0 if self._engine.chooses else 1)
+                failures = state.failures + (0 if self._engine.workers_pick_runs else 1)
                 lost = FAILED if failures > self._settings.retries else STOPPED
                 self._folder.set_state(index, State(lost, failures, LOST_REASON))
 
-    def _report(self, board: Board) -> int:
+    def _report(self, board: Display) -> int:
         failed = board.closing_table()
         complete = sum(view.state == COMPLETE for view in board.views)
         print(f"{complete} of {len(board.views)} runs complete: {_places(self._plan)}")
@@ -211,10 +211,10 @@ class Sweep:
         return str(self._folder.header()["command"])
 
 
-def entries_of(plan: Plan, output_dir: Path) -> list[Entry]:
+def entries_of(plan: Plan, output_dir: Path) -> list[SweepRun]:
     """The runs of a plan as its sweep's folder keeps them."""
     return [
-        Entry(
+        SweepRun(
             index=run.index,
             name=run.spec.name,
             cell=run.spec.cell,

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.heartbeat import read_status
-from sweeps.folder import COMPLETE, DIVERGED, FAILED, RUNNING, STOPPED, WAITING, Entry, State, is_alive
+from acmr.tracking.status_file import read_status
+from sweeps.folder import COMPLETE, DIVERGED, FAILED, RUNNING, STOPPED, WAITING, State, SweepRun, is_alive
 
 #: A run that says it is running, but whose process is gone or has said nothing for so many seconds.
 LOST, SILENCE = "lost", 600.0
@@ -22,7 +22,7 @@ _COLORS = {COMPLETE: "green", DIVERGED: "magenta", FAILED: "red", RUNNING: "cyan
 
 
 @dataclass(frozen=True)
-class RunView:
+class RunStatus:
     """One run as it stands.
 
     Attributes:
@@ -53,7 +53,7 @@ class RunView:
         return (self.total - self.step) / self.speed if self.state == RUNNING and self.speed > 0 else None
 
 
-def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State | None = None) -> RunView:
+def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State | None = None) -> RunStatus:
     """Looks at one run.
 
     Args:
@@ -67,11 +67,11 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
     if summary is not None and summary.get("status") in (COMPLETE, DIVERGED):
         step, speed = int(summary.get("global_step") or 0), float(summary.get("steps_per_second") or 0)
         total = int(summary.get("total_timesteps") or total)
-        return RunView(name, seed, directory, summary["status"], step, total, speed, summary.get("final_return"))
+        return RunStatus(name, seed, directory, summary["status"], step, total, speed, summary.get("final_return"))
     status = read_status(directory) or {}
     alive = status.get("state") == RUNNING and _is_alive(status)
     told, reason = _told(status, state or State(STOPPED), alive)
-    return RunView(
+    return RunStatus(
         name=name,
         seed=seed,
         directory=directory,
@@ -85,8 +85,8 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
 
 
 def view_entries(
-    output_dir: Path, entries: Sequence[Entry], states: Sequence[State], known: Mapping[int, RunView] | None = None
-) -> list[RunView]:
+    output_dir: Path, entries: Sequence[SweepRun], states: Sequence[State], known: Mapping[int, RunStatus] | None = None
+) -> list[RunStatus]:
     """Looks at the runs of a sweep; a student whose teacher cannot become complete is ``blocked``.
 
     Args:
@@ -95,7 +95,7 @@ def view_entries(
         states: What the sweep knows of each.
         known: Runs that need no second look, by index.
     """
-    views: list[RunView] = []
+    views: list[RunStatus] = []
     for entry, told in zip(entries, states, strict=True):
         if known and entry.index in known:
             views.append(known[entry.index])
@@ -106,12 +106,12 @@ def view_entries(
         teacher = views[entry.teacher] if entry.teacher is not None else None
         if teacher is not None and view.state in (WAITING, STOPPED) and teacher.state in (FAILED, DIVERGED, BLOCKED):
             reason = f"waits for its teacher {teacher.name} seed {teacher.seed}, which {_verb(teacher.state)}"
-            view = RunView(view.name, view.seed, view.directory, BLOCKED, total=view.total, reason=reason)
+            view = RunStatus(view.name, view.seed, view.directory, BLOCKED, total=view.total, reason=reason)
         views.append(view)
     return views
 
 
-def table(views: Iterable[RunView]) -> list[tuple[str, str | None]]:
+def table(views: Iterable[RunStatus]) -> list[tuple[str, str | None]]:
     """The runs, one a line below a header, each with its color."""
     shown = list(views)
     rows = [_HEADER, *(_cells(view) for view in shown)]
@@ -126,7 +126,7 @@ def table(views: Iterable[RunView]) -> list[tuple[str, str | None]]:
     return list(zip(lines, ["bold", *(_COLORS.get(view.state) for view in shown)], strict=True))
 
 
-def counts(views: Iterable[RunView]) -> str:
+def counts(views: Iterable[RunStatus]) -> str:
     """How many runs are in which state."""
     numbers: dict[str, int] = {}
     for view in views:
@@ -149,7 +149,7 @@ def span(seconds: float | None) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-def _cells(view: RunView) -> list[str]:
+def _cells(view: RunStatus) -> list[str]:
     share = f" {100 * view.step / view.total:3.0f}%" if view.total else ""
     return [
         view.name,

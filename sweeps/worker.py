@@ -12,9 +12,9 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from acmr.config import ConfigError
-from acmr.run_dir import RunDir
-from sweeps.folder import COMPLETE, DIVERGED, FAILED, FINAL, RUNNING, STOPPED, Entry, State, SweepFolder
-from sweeps.job import STOP_SIGNALS, Training
+from acmr.storage.run_dir import RunDir
+from sweeps.folder import COMPLETE, DIVERGED, FAILED, FINAL, RUNNING, STOPPED, State, SweepFolder, SweepRun
+from sweeps.job import STOP_SIGNALS, TrainingProcess
 
 #: The run that a job takes up where it may choose.
 NEXT = "next"
@@ -56,7 +56,7 @@ class Worker:
         self._folder, self._parent = folder, parent
         header = folder.header()
         self._order: list[int] = header["order"]
-        self._entries = [Entry(**run) for run in header["runs"]]
+        self._entries = [SweepRun(**run) for run in header["runs"]]
         self._retries, self._grace = int(header["retries"]), float(header["grace"])
 
     def take_next(self) -> None:
@@ -122,9 +122,9 @@ class Worker:
             if final or (bound and code in _ENDED_FROM_OUTSIDE):
                 return
 
-    def _attempt(self, entry: Entry) -> tuple[int, str]:
+    def _attempt(self, entry: SweepRun) -> tuple[int, str]:
         run_dir = self._folder.output_dir / entry.directory
-        training = Training(self._folder.job_file(entry.index), run_dir / OUTPUT_FILE, entry.threads)
+        training = TrainingProcess(self._folder.job_file(entry.index), run_dir / OUTPUT_FILE, entry.threads)
         try:
             while (code := training.wait()) is None and not self._is_over():
                 pass

@@ -10,8 +10,8 @@ import pytest
 import torch
 from hypothesis import settings
 
-from acmr.checkpoint import FORMAT_VERSION, Teacher, TeacherDescription, load_teacher, save_teacher
-from acmr.networks import Dimensions, Networks
+from acmr.agent.networks import Dimensions, Networks
+from acmr.transfer.teacher import FORMAT_VERSION, Teacher, TeacherDescription, load_teacher, save_teacher
 
 torch.set_num_threads(1)
 # Tests that are started in the background inherit that Ctrl-C and hanging up are ignored; the programs under test would

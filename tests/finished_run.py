@@ -11,10 +11,10 @@ import torch
 import yaml
 from gymnasium.spaces import Box
 
-from acmr.checkpoint import FORMAT_VERSION, TeacherDescription, save_teacher
+from acmr.agent.networks import Dimensions, Networks
 from acmr.config import EnvConfig
 from acmr.envs import describe, make_env
-from acmr.networks import Dimensions, Networks
+from acmr.transfer.teacher import FORMAT_VERSION, TeacherDescription, save_teacher
 
 ANT = EnvConfig(
     name="ant_three_legs",

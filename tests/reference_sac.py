@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from acmr.agent.networks import Networks
+from acmr.agent.replay_buffer import Batch
 from acmr.config import SACConfig
-from acmr.networks import Networks
-from acmr.replay_buffer import Batch
 
 #: What :meth:`SAC.metrics` reports: means over the updates since it was last asked.
 METRIC_NAMES = ("critic_loss", "actor_loss", "alpha_loss", "q_value_1", "q_value_2", "alpha", "entropy")

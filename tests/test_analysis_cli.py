@@ -12,12 +12,13 @@ import pytest
 from analysis_runs import rows_reaching, write_run
 
 from acmr.records import CELLS
-from analysis import FORMATS, stills
+from analysis import FORMATS
 from analysis.cli import main
-from analysis.figures import picture, save
-from analysis.load import load
-from analysis.settings import setting_differences
-from analysis.style import apply
+from analysis.figures import stills
+from analysis.figures.paper import picture, save
+from analysis.figures.style import apply
+from analysis.loading.load import load
+from analysis.loading.setting_differences import setting_differences
 
 ROOT = Path(__file__).resolve().parent.parent
 

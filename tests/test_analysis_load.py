@@ -10,8 +10,8 @@ import pytest
 from analysis_runs import HEADER, PAIRS, csv_text, rows_reaching, run_directory, write_matrix, write_run
 
 from acmr.records import CELLS
-from analysis.load import InputError, RunSet, load
-from analysis.missing import missing_runs
+from analysis.loading.load import InputError, RunSet, load
+from analysis.loading.missing import missing_runs
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from analysis.load import load
-from analysis.metrics import (
+from analysis.loading.load import load
+from analysis.statistics.metrics import (
     area_under_curve,
     asymptotic_return,
     initial_return,

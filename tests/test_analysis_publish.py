@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from analysis_runs import rows_reaching, run_directory, write_run
 
-from analysis.load import load
+from analysis.loading.load import load
 from analysis.publish import PublishError, publish
 
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from analysis_runs import rows_reaching, write_run
 
-from analysis.load import load
-from analysis.metrics import measure
-from analysis.speed import POINTS, read_speed, training_speeds
+from analysis.figures.data import training_speeds
+from analysis.loading.load import load
+from analysis.loading.speed import POINTS, read_speed
+from analysis.statistics.metrics import measure
 
 HEADER = "global_step,steps_per_second,critic_loss\n"
 

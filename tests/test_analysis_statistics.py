@@ -14,7 +14,8 @@ from lifelines.statistics import logrank_test
 from lifelines.utils import restricted_mean_survival_time
 from scipy import stats
 
-from analysis.statistics import (
+from analysis.statistics.survival import kaplan_meier, log_rank, log_rank_scores, restricted_mean
+from analysis.statistics.two_samples import (
     detectable_effect,
     hedges_g,
     holm,
@@ -26,7 +27,6 @@ from analysis.statistics import (
     smallest_permutation_p,
     t_test,
 )
-from analysis.survival import kaplan_meier, log_rank, log_rank_scores, restricted_mean
 
 #: A busy machine is no failure.
 UNHURRIED = settings(deadline=None)

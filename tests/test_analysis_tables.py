@@ -12,11 +12,12 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from acmr.records import CELLS
-from analysis.comparisons import PAPER_ROWS
-from analysis.load import InputError, load
-from analysis.pipeline import Analysis, analyze
-from analysis.published import published_table3, side_by_side
-from analysis.tables import paper_columns, scores, steps_table, table1, table2, transfer_table, write_table
+from analysis.analyze import Analysis, analyze
+from analysis.loading.load import InputError, load
+from analysis.report.published import published_table3, side_by_side
+from analysis.report.tables import paper_columns, write_table
+from analysis.statistics.comparisons import PAPER_ROWS
+from analysis.statistics.summaries import scores, steps_table, table1, table2, transfer_table
 
 #: As the issue and the paper's table 3 have them.
 FIRST_COLUMNS = [

@@ -1,81 +1,113 @@
-"""Imports only go down (docs/architecture.md), and each file stays readable."""
+"""The import rule, read from docs/architecture.md, which prints it; and the size of files, packages and importers."""
 
 import ast
+import re
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Each floor may import the floors below it; within a floor, only what is listed.
-FLOORS = [
-    {"config", "seeding", "records", "durable", "provenance", "heartbeat", "stopping"},
-    {"run_dir", "networks", "matmul", "envs", "wandb_backend", "progress"},
-    {"checkpoint", "replay_buffer", "learner", "tracking", "snapshots", "fingerprint", "camera"},
-    {"transfer", "sac", "mirror", "video", "segments"},
-    {"trainer", "recorder", "compose", "rollout", "disk"},
-    {"identity", "messages", "run_state", "evaluation"},
-    {"preparation", "summary", "resume"},
-    {"experiment"},
-]
-HYDRA_BORDER = {"compose", "messages"}
 PACKAGES = ("acmr", "analysis", "sweeps")
+#: Modules of one package; a longer list is no map.
+MOST_MODULES = 11
+#: Packages that may know Hydra; below them settings are plain dataclasses.
+HYDRA_BORDER = ("acmr/settings", "sweeps")
+#: Importing these takes seconds, and reading results needs none of them.
+HEAVY = {"torch", "wandb", "hydra", "omegaconf", "mujoco", "gymnasium"}
 
 
-def modules(package: str) -> dict[str, Path]:
-    """Module name below the package (``envs`` for all of a subpackage) by file."""
-    folder = ROOT / package
-    return {str(path.relative_to(ROOT)): path for path in sorted(folder.rglob("*.py"))}
+def read_rule(package: str) -> list[list[set[str]]]:
+    """Levels of a package, lowest first; a level has groups of parts, and a group may not import another one."""
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    line = re.search(rf"^{package}: +(.+)$", page, re.MULTILINE)
+    assert line, f"docs/architecture.md has no import rule of {package}"
+    return [[set(group.split(", ")) for group in level.split(" | ")] for level in line[1].split(" <- ")]
+
+
+def sources(*packages: str) -> list[Path]:
+    return [path for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_of(path): path for path in sources(*PACKAGES)}
 
 
 def imports(path: Path) -> set[str]:
+    """Every module that a file imports, wherever in it; what is imported from a package counts as the module it is."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found.add(node.module)
+            inner = {f"{node.module}.{alias.name}" for alias in node.names} & MODULES.keys()
+            found |= inner or {node.module}
     return found
 
 
-def floor_of(name: str) -> int:
-    floors = [index for index, members in enumerate(FLOORS) if name in members]
-    assert floors, f"acmr/{name} stands on no floor of tests/test_architecture.py"
-    return floors[0]
+def part_of(module: str) -> str:
+    """What the rule calls a module: its package below the top, or itself."""
+    return module.split(".")[1]
 
 
-ACMR = [path for path in modules("acmr").values() if path.name != "__init__.py" or path.parent.name != "acmr"]
+def names(path: Path) -> str:
+    return str(path.relative_to(ROOT))
 
 
-@pytest.mark.parametrize("path", ACMR, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("path", sources("acmr", "analysis"), ids=names)
 def test_imports_go_down(path):
-    part = path.relative_to(ROOT / "acmr").parts[0].removesuffix(".py")
-    floor = floor_of(part)
+    package, _, below = module_of(path).partition(".")
+    if not below or below.endswith("__main__"):
+        return
+    rule = read_rule(package)
+    level_of = {part: index for index, level in enumerate(rule) for group in level for part in group}
+    own = part_of(module_of(path))
+    siblings = next(group for group in rule[level_of[own]] if own in group)
     for module in imports(path):
-        if module.startswith("acmr."):
-            other = module.split(".")[1]
-            if other != part:
-                assert floor_of(other) < floor, f"{part} (floor {floor}) imports {other} (floor {floor_of(other)})"
+        if module.startswith(f"{package}."):
+            other = part_of(module)
+            assert other in siblings or level_of[other] < level_of[own], f"{module_of(path)} imports {module}"
 
 
-@pytest.mark.parametrize("path", ACMR, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_part_is_in_the_rule():
+    for package in ("acmr", "analysis"):
+        parts = {part_of(module) for module in MODULES if module.startswith(f"{package}.")} - {"__main__"}
+        assert parts == {part for level in read_rule(package) for group in level for part in group}
+
+
+def test_the_analysis_takes_only_the_ground_of_acmr():
+    ground = {f"acmr.{part}" for part in read_rule("acmr")[0][0]}
+    for path in sources("analysis"):
+        for module in imports(path):
+            assert not module.startswith("acmr") or module in ground, path
+            assert module.split(".")[0] not in HEAVY | {"sweeps"}, path
+
+
+@pytest.mark.parametrize("path", sources("acmr"), ids=names)
 def test_only_the_border_knows_hydra(path):
     tops = {module.split(".")[0] for module in imports(path)}
-    if path.stem not in HYDRA_BORDER:
-        assert not tops & {"hydra", "omegaconf"}
     assert not tops & {"analysis", "sweeps"}
+    if not names(path).startswith(HYDRA_BORDER):
+        assert not tops & {"hydra", "omegaconf"}
 
 
-def test_analysis_needs_neither_torch_nor_wandb():
-    for path in modules("analysis").values():
-        for module in imports(path):
-            assert module.split(".")[0] not in ("torch", "wandb", "hydra", "omegaconf", "mujoco", "sweeps"), path
-            assert not module.startswith("acmr") or module == "acmr.records", path
+def test_there_is_no_circle_and_nobody_imports_a_command_line():
+    graph = {module: imports(path) & MODULES.keys() - {module} for module, path in MODULES.items()}
+    # Raises CycleError with the circle.
+    TopologicalSorter(graph).prepare()
+    assert not [module for module, found in graph.items() if any(name.endswith("__main__") for name in found)]
 
 
-@pytest.mark.parametrize(
-    "path",
-    [path for package in (*PACKAGES, "tests", "bench") for path in modules(package).values()],
-    ids=lambda path: str(path.relative_to(ROOT)),
-)
+def test_no_package_has_too_many_modules():
+    for package in {path.parent for path in MODULES.values()}:
+        count = len([path for path in package.glob("*.py") if not path.name.startswith("__")])
+        assert count <= MOST_MODULES, f"{names(package)}: {count} modules"
+
+
+@pytest.mark.parametrize("path", sources(*PACKAGES, "tests", "bench"), ids=names)
 def test_no_file_is_longer_than_300_lines(path):
     assert len(path.read_text().splitlines()) <= 300

@@ -9,11 +9,11 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acmr.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.config import ExperimentConfig, SACConfig
-from acmr.identity import specify, teacher_spec
-from acmr.messages import USER_ERRORS, check_booleans, explain
 from acmr.records import CELLS
+from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
+from acmr.settings.errors import USER_ERRORS, check_booleans, explain
+from acmr.settings.run_spec import specify, teacher_spec
 
 LEAVES = [
     f"{path.parent.name}={path.stem}"

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from torture import ANT, HUMANOID, Run, at_step, found_out
 
-from acmr.disk import arrays_bytes, space_needed
-from acmr.snapshots import SnapshotStore
+from acmr.run.preparation import arrays_bytes, space_needed
+from acmr.storage.checkpoint_store import SnapshotStore
 
 
 def test_a_run_takes_at_most_what_was_expected_and_not_much_less(tmp_path):

@@ -8,8 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from acmr import durable
-from acmr.durable import Appender, DamagedError, Mark, WriteError, make_folder, read_marked, read_regular, write_bytes
+from acmr.storage import durable
+from acmr.storage.durable import (
+    Appender,
+    DamagedError,
+    FileDigest,
+    WriteError,
+    make_folder,
+    read_marked,
+    read_regular,
+    write_bytes,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -114,7 +123,7 @@ def test_an_appended_file_is_cut_back_to_what_was_marked(tmp_path):
     again = Appender(path, mark)
     assert path.read_bytes() == b"".join(f"{row}\n".encode() for row in range(20))
     again.append(b"more\n")
-    assert again.mark() == Mark.of(path.read_bytes())
+    assert again.mark() == FileDigest.of(path.read_bytes())
     again.close()
 
 
@@ -135,9 +144,9 @@ def test_an_appended_file_that_was_changed_is_left_as_it_is(damage, tmp_path):
 def test_a_whole_file_must_hold_nothing_else(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(b"contentmore")
-    assert read_marked(path, Mark.of(b"content")) == b"content"
+    assert read_marked(path, FileDigest.of(b"content")) == b"content"
     with pytest.raises(DamagedError, match="11 bytes, at most 7"):
-        read_marked(path, Mark.of(b"content"), whole=True)
+        read_marked(path, FileDigest.of(b"content"), whole=True)
 
 
 def test_no_link_is_followed_and_nothing_else_is_read(tmp_path):

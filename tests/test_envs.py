@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete
 
-from acmr.compose import compose_config, parse
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs import describe, make_env
 from acmr.envs.__main__ import leaves, read_leaf
+from acmr.settings.compose import compose_config, parse
 
 ROOT = Path(__file__).resolve().parent.parent
 DIMENSIONS = {

@@ -13,7 +13,7 @@ from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from acmr.config import EnvConfig
 from acmr.envs import describe, make_env
 from acmr.envs.__main__ import leaves, read_leaf
-from acmr.envs.features import part_names
+from acmr.envs.naming import part_names
 
 COMPONENTS = {"x": 0, "y": 1, "z": 2, "qw": 3, "qx": 4, "qy": 5, "qz": 6, "wx": 3, "wy": 4, "wz": 5}
 #: What environments show only within limits.

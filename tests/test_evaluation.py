@@ -12,9 +12,9 @@ import yaml
 from finished_run import ANT, make_run, result
 from safetensors.numpy import load_file
 
+from acmr.agent.networks import Dimensions
 from acmr.envs import make_env
-from acmr.evaluation import main
-from acmr.networks import Dimensions
+from acmr.evaluation.cli import main
 
 
 @pytest.fixture

@@ -139,7 +139,7 @@ def test_what_the_environment_gives_must_be_finite(what, cause, tmp_path):
 
 
 def test_a_learner_that_is_not_finite_is_never_stored(tmp_path):
-    from acmr.sac import SAC
+    from acmr.agent.sac import SAC
 
     def poison() -> None:
         update = SAC.update

@@ -13,11 +13,11 @@ import yaml
 from safetensors.numpy import save as save_arrays
 from torture import ANT, Run, at_step
 
-from acmr.checkpoint import load_teacher
+from acmr.agent.networks import Dimensions
 from acmr.config import ConfigError
-from acmr.networks import Dimensions
-from acmr.run_dir import RunDir
-from acmr.snapshots import Snapshot, SnapshotStore
+from acmr.storage.checkpoint_store import Snapshot, SnapshotStore
+from acmr.storage.run_dir import RunDir
+from acmr.transfer.teacher import load_teacher
 
 DIMS, WIDTHS = Dimensions(5, 2), (8, 8)
 
@@ -193,14 +193,14 @@ def test_arrays_that_do_not_fit_are_refused(stopped):
 
 
 def test_a_segment_larger_than_the_buffer_is_not_read(stopped):
-    from acmr.durable import Mark
+    from acmr.storage.durable import FileDigest
 
     folder = stopped.folder / "checkpoint"
     path = folder / "segment_0_40.safetensors"
     path.write_bytes(save_arrays({"rows": np.zeros((10_000, 35), np.float32)}))
     store = SnapshotStore(folder, 1 << 30)
     snapshot = store.read(80)
-    files = {**snapshot.files, path.name: Mark.of(path.read_bytes())}
+    files = {**snapshot.files, path.name: FileDigest.of(path.read_bytes())}
     store.write(80, Snapshot(snapshot.values, snapshot.arrays, files))
     assert "larger than this run's replay buffer" in stopped().said
 

@@ -8,15 +8,15 @@ import pytest
 import torch
 from torch import nn
 
-from acmr import matmul
+from acmr.agent import precision as matmul_precision
+from acmr.agent.kernels import arrays
+from acmr.agent.kernels.layers import CriticStack, Stack, columns
+from acmr.agent.kernels.parameters import Adam, FlatParameters
+from acmr.agent.kernels.policy import SquashedGaussian
+from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.replay_buffer import ReplayBuffer
+from acmr.agent.sac import SAC
 from acmr.config import PRECISIONS, SACConfig
-from acmr.learner import arrays
-from acmr.learner.layers import CriticStack, Stack, columns
-from acmr.learner.parameters import Adam, FlatParameters
-from acmr.learner.policy import SquashedGaussian
-from acmr.networks import Dimensions, Networks
-from acmr.replay_buffer import ReplayBuffer
-from acmr.sac import SAC
 
 DIMS, CORE = Dimensions(11, 3), Dimensions(14, 5)
 LOW, HIGH = np.array([-0.4, -1.0, 0.0], np.float32), np.array([0.4, 1.0, 2.0], np.float32)
@@ -241,17 +241,17 @@ def _restore_precision():
 
 @pytest.mark.usefixtures("_restore_precision")
 def test_products_are_float32_and_by_onednn_where_that_pays():
-    assert matmul.choose_products(SACConfig(hidden_sizes=[64, 64], batch_size=128)).precision == "highest"
-    chosen = matmul.choose_products(SACConfig())
+    assert matmul_precision.choose_products(SACConfig(hidden_sizes=[64, 64], batch_size=128)).precision == "highest"
+    chosen = matmul_precision.choose_products(SACConfig())
     assert chosen.precision == torch.get_float32_matmul_precision()
-    assert chosen.relative_error < matmul.TOLERANCE
+    assert chosen.relative_error < matmul_precision.TOLERANCE
     assert (chosen.rejected_error is None) == (chosen.precision == "medium")
 
 
 @pytest.mark.usefixtures("_restore_precision")
 def test_products_that_are_not_accurate_enough_are_refused():
     with pytest.raises(RuntimeError, match="relative error"):
-        matmul.use_fast_float32(tolerance=1e-9)
+        matmul_precision.use_fast_float32(tolerance=1e-9)
     assert torch.get_float32_matmul_precision() == "highest"
 
 
@@ -259,5 +259,5 @@ def test_the_guard_sees_bfloat16():
     left, right = torch.randn(256, 393), torch.randn(393, 256)
     exact = left.double() @ right.double()
     rounded = (left.bfloat16() @ right.bfloat16()).double()
-    assert (rounded - exact).norm() / exact.norm() > 100 * matmul.TOLERANCE
-    assert matmul.relative_error() < matmul.TOLERANCE
+    assert (rounded - exact).norm() / exact.norm() > 100 * matmul_precision.TOLERANCE
+    assert matmul_precision.relative_error() < matmul_precision.TOLERANCE

@@ -5,10 +5,10 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from acmr.agent.networks import Dimensions
+from acmr.agent.replay_buffer import Batch
+from acmr.agent.sac import SAC
 from acmr.config import SACConfig
-from acmr.networks import Dimensions
-from acmr.replay_buffer import Batch
-from acmr.sac import SAC
 from bench.contenders import cell_networks
 from bench.work import flops, step_work
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch.distributions import AffineTransform, Independent, Normal, TanhTransform, TransformedDistribution
 
-from acmr.networks import Dimensions, Networks, is_hidden, linear
+from acmr.agent.networks import Dimensions, Networks, is_hidden, linear
 
 DIMS = Dimensions(7, 3)
 LOW, HIGH = np.array([-0.4, -1.0, 0.0], np.float32), np.array([0.4, 1.0, 3.0], np.float32)

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from acmr.config import ConfigError
-from acmr.progress import BarProgress, LineProgress, RunProgress, duration, make_progress
 from acmr.records import EpisodeRecord
+from acmr.tracking.progress import BarProgress, LineProgress, RunProgress, duration, make_progress
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 NOISY_RUN = """
 import logging, sys, time
 logging.basicConfig(stream=sys.stdout, level=logging.INFO, format="%(message)s")
-from acmr.progress import make_progress
+from acmr.tracking.progress import make_progress
 from acmr.records import EpisodeRecord
 progress = make_progress("auto", total_timesteps=3000, threshold=900, title="A2 ant seed 1")
 for step in range(1, 3001):

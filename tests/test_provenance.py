@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from acmr.provenance import machine
+from acmr.run.reproducibility import machine
 
 
 @pytest.mark.skipif(shutil.which("lscpu") is None, reason="no lscpu here to compare with")

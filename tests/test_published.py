@@ -13,10 +13,10 @@ import pytest
 import yaml
 from safetensors.numpy import load_file
 
-from acmr.compose import compose_config, parse
-from acmr.identity import differing_keys
-from analysis.load import load
-from analysis.pipeline import analyze
+from acmr.config import differing_keys
+from acmr.settings.compose import compose_config, parse
+from analysis.analyze import analyze
+from analysis.loading.load import load
 
 ROOT = Path(__file__).resolve().parent.parent
 PUBLISHED = ROOT / "results" / "paper"

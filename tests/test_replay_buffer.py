@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acmr.replay_buffer import Batch, JoinedBatch, ReplayBuffer
+from acmr.agent.replay_buffer import Batch, JoinedBatch, ReplayBuffer
 
 OBSERVATION, ACTION = 3, 2
 

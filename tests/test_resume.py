@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from torture import ANT, HUMANOID, SMALL, Run, at_step, same
 
-from acmr.snapshots import SnapshotStore
+from acmr.storage.checkpoint_store import SnapshotStore
 
 PENDULUM = ("env=gym", "env.id=Pendulum-v1", "env.max_episode_steps=30", "total_timesteps=220", *SMALL)
 KINDS = {"humanoid": HUMANOID, "ant": ANT, "pendulum": PENDULUM}

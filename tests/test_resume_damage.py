@@ -11,9 +11,9 @@ import pytest
 from torture import ANT, Run, at_step, content_hash, parts
 
 from acmr.config import ConfigError
-from acmr.resume import Checkpoints
-from acmr.run_state import RunState
-from acmr.snapshots import SnapshotStore
+from acmr.run.checkpointing import Checkpoints
+from acmr.run.run_state import RunState
+from acmr.storage.checkpoint_store import SnapshotStore
 
 ROUNDS = int(os.environ.get("ACMR_TORTURE", "1"))
 FLIPS, CUTS = 300 * ROUNDS, 60 * ROUNDS

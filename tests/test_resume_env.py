@@ -7,11 +7,11 @@ import pytest
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 
-from acmr.compose import environment_config
 from acmr.config import EnvConfig
 from acmr.envs import make_env
 from acmr.envs.physics import PhysicsWarnings
 from acmr.envs.state import ANYTIME, BETWEEN_EPISODES, NEVER, EnvState, capture, data_arrays, rehearse, restore
+from acmr.settings.compose import environment_config
 
 OURS = ("humanoid", "armless_humanoid", "humanoid_v5", "armless_humanoid_v5", "ant", "ant_three_legs")
 ROBOTS = (

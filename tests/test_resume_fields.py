@@ -12,7 +12,7 @@ import pytest
 from torture import ANT, HUMANOID, Run, at_step, parts
 
 from acmr.envs.state import capture
-from acmr.snapshots import Snapshot, SnapshotStore
+from acmr.storage.checkpoint_store import Snapshot, SnapshotStore
 
 #: Before learning starts random actions are drawn, after it nets are learned: an entry must matter at one of them.
 STEPS = (40, 120)

@@ -11,8 +11,8 @@ import pytest
 import torch
 import yaml
 
-from acmr.checkpoint import load_teacher
 from acmr.records import CELLS
+from acmr.transfer.teacher import load_teacher
 
 ROOT = Path(__file__).resolve().parent.parent
 SHORT = ["profile=quick", "total_timesteps=1400", "tracking=off", "log_every=400"]

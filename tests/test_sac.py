@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.replay_buffer import Batch
+from acmr.agent.sac import METRIC_NAMES, SAC
 from acmr.config import SACConfig, TransferConfig
-from acmr.networks import Dimensions, Networks
-from acmr.replay_buffer import Batch
-from acmr.sac import METRIC_NAMES, SAC
-from acmr.transfer import transfer
+from acmr.transfer.methods import transfer
 
 DIMS, TEACHER_DIMS = Dimensions(6, 2), Dimensions(9, 4)
 LOW, HIGH = np.full(2, -0.5, np.float32), np.full(2, 1.5, np.float32)

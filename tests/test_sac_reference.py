@@ -7,13 +7,13 @@ import pytest
 import torch
 from reference_sac import ReferenceSAC
 
+from acmr.agent.kernels import arrays
+from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.precision import use_fast_float32
+from acmr.agent.replay_buffer import Batch
+from acmr.agent.sac import SAC
 from acmr.config import SACConfig, TransferConfig
-from acmr.learner import arrays
-from acmr.matmul import use_fast_float32
-from acmr.networks import Dimensions, Networks
-from acmr.replay_buffer import Batch
-from acmr.sac import SAC
-from acmr.transfer import transfer
+from acmr.transfer.methods import transfer
 
 SOURCE, TARGET = Dimensions(45, 9), Dimensions(31, 7)
 UPDATES = 100

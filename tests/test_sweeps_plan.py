@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from acmr.compose import CONFIG_FOLDER, compose_config, parse, register_schema
 from acmr.config import ConfigError
-from acmr.identity import RunSpec, specify
-from acmr.messages import USER_ERRORS, explain
-from acmr.run_dir import RunDir
+from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse, register_schema
+from acmr.settings.errors import USER_ERRORS, explain
+from acmr.settings.run_spec import RunSpec, specify
+from acmr.storage.run_dir import RunDir
 from sweeps.estimate import estimate
 from sweeps.folder import SweepFolder
 from sweeps.job import read_job, write_job

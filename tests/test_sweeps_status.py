@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from sweeps.folder import FAILED, RUNNING, STOPPED, Entry, State, SweepFolder, all_folders
+from sweeps.folder import FAILED, RUNNING, STOPPED, State, SweepFolder, SweepRun, all_folders
 from sweeps.status import main
 from sweeps.view import counts, span, view_entries, view_run
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 
 
-def entry(index: int, **more: object) -> Entry:
+def entry(index: int, **more: object) -> SweepRun:
     values = {"index": index, "name": f"run{index}", "cell": None, "seed": index, "total_timesteps": 1000, "threads": 1}
     values |= {"directory": f"quick/run{index}/seed_{index}", "teacher": None, "ended": None}
-    return Entry(**(values | more))
+    return SweepRun(**(values | more))
 
 
 def heartbeat(
@@ -52,7 +52,7 @@ def gone() -> int:
     return process.pid
 
 
-def sweep(out: Path, *entries: Entry) -> SweepFolder:
+def sweep(out: Path, *entries: SweepRun) -> SweepFolder:
     header = {"command": "python run.py", "retries": 2, "grace": 20}
     return SweepFolder.create(out, header, entries, [entry.index for entry in entries], CONF)
 

@@ -14,9 +14,9 @@ import yaml
 from tracking_tools import ID, RUN, SETTINGS, history, inspect, records, start, the_mirror
 
 from acmr.config import ConfigError, TrackingConfig
-from acmr.mirror import main, rebuild
 from acmr.records import EpisodeRecord
-from acmr.wandb_backend import linked_mirrors, run_id
+from acmr.tracking.mirror import main, rebuild
+from acmr.tracking.wandb_backend import linked_mirrors, run_id
 
 EPISODE = EpisodeRecord(120, 71.25, 120, 0.5, {"reward_forward": 3.5, "reward_ctrl": -1.0})
 EPISODE_ROW = {

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tracking_tools import ID, child, history, records, start, the_mirror
 
-from acmr import tracking
+from acmr.tracking import wandb_tracker
 
 
 def test_an_unfinished_tracker_does_not_keep_a_process(tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_a_failure_costs_one_warning_and_never_the_run(tmp_path: Path, failure: 
 
 
 def test_rows_that_stop_arriving_are_noticed_during_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tracking, "ARRIVAL_CHECK", 1.2)
+    monkeypatch.setattr(wandb_tracker, "ARRIVAL_CHECK", 1.2)
     warnings: list[str] = []
     tracker = start(tmp_path, warnings)
     until = time.monotonic() + 2.6

@@ -15,11 +15,11 @@ from typing import Any
 
 import pytest
 
-from acmr import tracking, wandb_backend
 from acmr.config import TrackingConfig
-from acmr.mirror import main, unsent
 from acmr.records import EpisodeRecord
-from acmr.tracking import Tracker, make_tracker
+from acmr.tracking import wandb_backend, wandb_tracker
+from acmr.tracking.mirror import main, unsent
+from acmr.tracking.wandb_tracker import Tracker, make_tracker
 
 KEY = "k" * 40
 NAME = "quick-ant-none-s1"
@@ -241,7 +241,7 @@ def test_a_server_that_goes_away_delays_nothing_and_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(wandb_backend, "SERVER_WAIT", 2.0)
-    monkeypatch.setattr(tracking, "SERVER_WAIT", 2.0)
+    monkeypatch.setattr(wandb_tracker, "SERVER_WAIT", 2.0)
     first, warnings = Server(), list[str]()
     tracker = start(tmp_path, warnings, first.url)
     tracker.metrics(1, {"alpha": 0.5})

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from acmr.compose import CONFIG_FOLDER
+from acmr.agent.networks import Dimensions, Networks
 from acmr.config import ConfigError, TransferConfig
-from acmr.networks import Dimensions, Networks
-from acmr.transfer import method, method_names, transfer
+from acmr.settings.compose import CONFIG_FOLDER
+from acmr.transfer import methods
+from acmr.transfer.methods import method, method_names, transfer
 
 SOURCE, TARGET = Dimensions(12, 5), Dimensions(8, 3)
 SIZES = (10, 9)
@@ -109,7 +110,7 @@ def test_every_method_has_a_yaml_file_and_the_other_way_round():
 
 
 def test_a_new_method_is_one_function(teacher_factory, monkeypatch):
-    monkeypatch.setattr("acmr.transfer._METHODS", dict(__import__("acmr.transfer").transfer._METHODS))
+    monkeypatch.setattr(methods, "_METHODS", dict(methods._METHODS))
 
     @method("heads")
     def heads(networks, teacher, config, generator):

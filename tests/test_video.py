@@ -14,11 +14,11 @@ import pytest
 from finished_run import ANT, make_run, result
 from PIL import Image, ImageSequence
 
-from acmr.camera import make_camera, open_gl
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs import make_env
-from acmr.evaluation import main
-from acmr.video import Film, GifWriter, steps_per_second
+from acmr.evaluation.camera import make_camera, open_gl
+from acmr.evaluation.cli import main
+from acmr.evaluation.video import Film, GifWriter, steps_per_second
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -20,21 +20,22 @@ from pathlib import Path
 
 import numpy as np
 
-import acmr.experiment as experiment
-from acmr import durable, fingerprint, summary
-from acmr.compose import compose_config, parse
+import acmr.run.experiment as experiment
+from acmr.agent.precision import MatmulPrecision, choose_products
+from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.config import ConfigError
 from acmr.envs import make_env
-from acmr.envs.state import Rehearsal, rehearse
-from acmr.identity import RunSpec, specify
-from acmr.matmul import Products, choose_products
-from acmr.preparation import Prepared, prepare
-from acmr.recorder import Recorder
-from acmr.replay_buffer import ReplayBuffer
-from acmr.resume import Checkpoints
-from acmr.run_dir import RunDir
-from acmr.run_state import RunState
-from acmr.stopping import StopSignals
+from acmr.envs.state import ResumeCheck, rehearse
+from acmr.run import reproducibility, summary
+from acmr.run.checkpointing import Checkpoints
+from acmr.run.preparation import Prepared, prepare
+from acmr.run.run_logs import Recorder
+from acmr.run.run_state import RunState
+from acmr.run.stop_signals import StopSignals
+from acmr.settings.compose import compose_config, parse
+from acmr.settings.run_spec import RunSpec, specify
+from acmr.storage import durable
+from acmr.storage.run_dir import RunDir
 
 #: Small networks, a buffer that wraps, rows of metrics that checkpoints fall between.
 SMALL = (
@@ -60,11 +61,11 @@ def spec(output: Path, *overrides: str) -> RunSpec:
 
 
 @cache
-def found_out(overrides: tuple[str, ...]) -> tuple[Prepared, Rehearsal, Products]:
+def found_out(overrides: tuple[str, ...]) -> tuple[Prepared, ResumeCheck, MatmulPrecision]:
     """What a run finds out of its settings before it touches the disk, found out once."""
     made = spec(Path("unused"), *overrides)
     # Whoever edits the program while these tests run does not change it for them.
-    fingerprint._program()
+    reproducibility._program()
     products = choose_products(made.config.agent, made.config.device)
     return prepare(made), rehearse(lambda: make_env(made.config.env)), products
 
@@ -183,7 +184,7 @@ def parts(run: Run) -> tuple[RunState, Checkpoints]:
     """The parts of a run in this process, as they are before its first step."""
     prepared, rehearsal, products = found_out(run.overrides)
     prepared = deepcopy(replace(prepared, spec=run.spec))
-    session = experiment.Attempt(prepared, rehearsal, products, RunDir(run.folder), StopSignals(), print)
+    session = experiment.Session(prepared, rehearsal, products, RunDir(run.folder), StopSignals(), print)
     return session.build()
 
 
@@ -231,7 +232,7 @@ def at_step(step: int, action: Callable[[], None] = die) -> Callable[[], None]:
 
 
 def at_write(number: int, action: Callable[[], None] = die) -> Callable[[], None]:
-    """Something that happens at one of the steps that :mod:`acmr.durable` takes, counted from 1."""
+    """Something that happens at one of the steps that :mod:`acmr.storage.durable` takes, counted from 1."""
 
     def prepare() -> None:
         count = 0
@@ -248,7 +249,7 @@ def at_write(number: int, action: Callable[[], None] = die) -> Callable[[], None
 
 
 def count_writes(into: Path) -> Callable[[], None]:
-    """Notes each step that :mod:`acmr.durable` takes as a line of a file."""
+    """Notes each step that :mod:`acmr.storage.durable` takes as a line of a file."""
 
     def prepare() -> None:
         stream = into.open("a", buffering=1)

@@ -14,8 +14,8 @@ from typing import Any
 from wandb.util import get_core_path
 
 from acmr.config import TrackingConfig
-from acmr.tracking import Tracker, labels, make_tracker
-from acmr.wandb_backend import mirrors_of
+from acmr.tracking.wandb_backend import mirrors_of
+from acmr.tracking.wandb_tracker import Tracker, labels, make_tracker
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN = "ant_three_legs-hidden-frozen"
@@ -35,7 +35,7 @@ import os, signal, subprocess, sys, time
 from pathlib import Path
 from acmr.config import TrackingConfig
 from acmr.records import EpisodeRecord
-from acmr.tracking import make_tracker
+from acmr.tracking.wandb_tracker import make_tracker
 settings = {SETTINGS!r}
 def start(mode="offline", folder=sys.argv[1]):
     return make_tracker(TrackingConfig(mode=mode), output_dir=Path(folder), run_name={RUN!r}, profile="quick", seed=3,

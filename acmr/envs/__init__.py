@@ -17,7 +17,7 @@ import numpy as np
 
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs.construct import cannot_run, construct
-from acmr.envs.features import Probe, probe
+from acmr.envs.naming import Probe, probe
 from acmr.envs.wrappers import PartialEnv, kept_rows
 from acmr.records import VELOCITY_KEY
 

@@ -17,7 +17,7 @@ from gymnasium.spaces import Box
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs import describe, make_env
 from acmr.envs.construct import find_spec, gym_ids
-from acmr.envs.features import part_names
+from acmr.envs.naming import part_names
 from acmr.envs.wrappers import near_matches
 
 LEAVES = Path(__file__).resolve().parents[2] / "conf" / "env"

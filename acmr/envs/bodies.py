@@ -11,7 +11,7 @@ from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 
 from acmr.config import ConfigError
-from acmr.envs.features import part_names
+from acmr.envs.naming import part_names
 
 
 def edited_model(path: str, remove: Sequence[str]) -> mujoco.MjModel:

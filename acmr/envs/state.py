@@ -99,7 +99,7 @@ def data_arrays(model: mujoco.MjModel) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Rehearsal:
+class ResumeCheck:
     """What was seen of an environment.
 
     Attributes:
@@ -111,7 +111,7 @@ class Rehearsal:
     trace: bytes
 
 
-def rehearse(make: Callable[[], Env]) -> Rehearsal:
+def rehearse(make: Callable[[], Env]) -> ResumeCheck:
     """Captures the state of one instance, puts another into it, and compares what both do next.
 
     Args:
@@ -129,7 +129,7 @@ def rehearse(make: Callable[[], Env]) -> Rehearsal:
         first.close()
     # The state within an episode is of use only where the next episode follows exactly as well.
     when = NEVER if not between[0] else ANYTIME if within[0] else BETWEEN_EPISODES
-    return Rehearsal(when, opening + within[1] + between[1])
+    return ResumeCheck(when, opening + within[1] + between[1])
 
 
 def knows_all_parts(env: Env) -> bool:

@@ -1,0 +1,1 @@
+"""Soft Actor-Critic: networks, learner and replay buffer."""

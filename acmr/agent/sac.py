@@ -1,0 +1,283 @@
+"""Soft Actor-Critic (Haarnoja et al. 2018) as the paper ran it.
+
+The passes through the networks are written out (:mod:`acmr.agent.kernels.layers`) and share what they can without
+changing a value; ``tests/reference_sac.py`` says the same plainly, with autograd, and the tests hold the two together.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from acmr.agent.kernels.arrays import Array, array_of, math_of, tensor_of
+from acmr.agent.kernels.layers import CriticStack, Stack, columns
+from acmr.agent.kernels.parameters import Adam, FlatParameters, Group
+from acmr.agent.kernels.policy import NumpyPolicy, Sample, SquashedGaussian
+from acmr.agent.networks import Actor, Critic, Networks, Trunk
+from acmr.agent.replay_buffer import Batch, JoinedBatch
+from acmr.config import SACConfig
+
+#: What :meth:`SAC.metrics` reports: means over the updates since it was last asked.
+METRIC_NAMES = ("critic_loss", "actor_loss", "alpha_loss", "q_value_1", "q_value_2", "alpha", "entropy")
+
+
+class SAC:
+    """Learns networks from batches of transitions.
+
+    The target critics start equal to the critics as they are given, so transfer and freezing come first.
+    Layers whose parameters do not require gradients are never stepped, and their target twins never move.
+    The parameters of the networks and targets become views into vectors that are learned as a whole.
+
+    Args:
+        networks: Actor and critics.
+        config: Hyperparameters.
+        acting: Generator of the noise of actions taken in the environment.
+        learning: Generator of the noise of actions sampled in the updates.
+        log_alpha: Initial log of the temperature.
+        device: Where the networks live.
+    """
+
+    def __init__(
+        self,
+        networks: Networks,
+        config: SACConfig,
+        acting: torch.Generator,
+        learning: torch.Generator,
+        log_alpha: float = 0.0,
+        device: str = "cpu",
+    ) -> None:
+        self.networks, self.config, self.device = networks.to(device), config, device
+        self._generators = {"acting": acting, "learning": learning}
+        self.targets = copy.deepcopy(nn.ModuleList(networks.critics)).requires_grad_(False)
+        self.target_entropy = -float(networks.dims.action)
+        self._math = math_of(networks.actor.action_scale)
+        self._build_networks()
+        start = log_alpha if config.autotune else math.log(config.alpha)
+        self.log_alpha = torch.full((1,), start, device=device)
+        self._alpha, self._log_alpha_gradient = self.log_alpha.exp(), torch.zeros(1, device=device)
+        self._alpha_array = array_of(self._alpha)
+        self._optimizers = {
+            "actor": Adam(self._actor_parameters.trainable, self._actor_parameters.gradient, config.policy_lr),
+            "critics": Adam(self._critic_parameters.trainable, self._critic_parameters.gradient, config.q_lr),
+            "log_alpha": Adam(self.log_alpha, self._log_alpha_gradient, config.q_lr),
+        }
+        self._sums: dict[str, Any] = dict.fromkeys(METRIC_NAMES, 0.0)
+        self._counts = dict.fromkeys(METRIC_NAMES, 0)
+        self._batch_size = 0
+
+    def _build_networks(self) -> None:
+        actor, critics, dims = self.networks.actor, self.networks.critics, self.networks.dims
+        self._reduced = self.config.precision == "bfloat16"
+        low_actor, low_critics = ([self._reduced and not head for head in _heads(net)] for net in (actor, critics[0]))
+        self._actor_parameters = FlatParameters(_actor_groups(actor), reduced=low_actor)
+        self._critic_parameters = FlatParameters(_critic_groups(critics), reduced=low_critics)
+        target_groups = _critic_groups([target for target in self.targets if isinstance(target, Critic)])
+        self._target_parameters = FlatParameters(target_groups, self._critic_parameters, low_critics)
+        relus = _relus(critics[0])
+        self._actor = Stack(self._actor_parameters.blocks, _relus(actor))
+        self._critics = CriticStack(self._critic_parameters.blocks, relus, dims.observation)
+        self._targets = CriticStack(self._target_parameters.blocks, relus, dims.observation)
+        self._policy = SquashedGaussian(actor.action_scale, actor.action_bias)
+        in_numpy = self._math is np
+        acting = Stack(self._actor_parameters.masters, _relus(actor)).layers
+        self._acting = NumpyPolicy(acting, actor.action_scale, actor.action_bias) if in_numpy else None
+
+    @torch.no_grad()
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Samples the policy's action, (action,), for one observation, (observation,)."""
+        noise = torch.randn((1, self.networks.dims.action), generator=self._generators["acting"])
+        if self._acting is not None:
+            return self._acting(observation, noise.numpy()[0])
+        observations = torch.as_tensor(observation, dtype=torch.float32, device=self.device).unsqueeze(0)
+        actions, _ = self.networks.actor.sample(observations, noise.to(self.device))
+        return actions[0].cpu().numpy()
+
+    @torch.no_grad()
+    def update(self, batch: Batch, global_step: int) -> None:
+        """Learns from one batch: what falls due at this environment step.
+
+        The critics learn at every step. Every ``policy_frequency`` steps the actor makes up for its delay
+        with as many updates on this batch, each followed by a temperature update.
+        """
+        joined = JoinedBatch.join(batch)
+        if self._reduced:
+            joined = joined.to(torch.bfloat16)
+        if len(joined.rewards) != self._batch_size:
+            self._allocate(len(joined.rewards))
+        self._update_critics(joined)
+        if global_step % self.config.policy_frequency == 0:
+            self._update_actor_and_temperature(joined.observations)
+        if global_step % self.config.target_network_frequency == 0:
+            # lerp leaves equal values bitwise equal; frozen layers are no part of these vectors.
+            self._target_parameters.trainable.lerp_(self._critic_parameters.trainable, self.config.tau)
+            self._target_parameters.refresh()
+
+    def metrics(self) -> dict[str, float]:
+        """Means over the updates since the last call; NaN where there were none."""
+        means = {
+            name: float(total) / self._counts[name] if self._counts[name] else float("nan")
+            for name, total in self._sums.items()
+        }
+        self._sums = dict.fromkeys(METRIC_NAMES, 0.0)
+        self._counts = dict.fromkeys(METRIC_NAMES, 0)
+        return means
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the following updates and actions depend on, as copies."""
+        return {
+            "tensors": {name: tensor.clone() for name, tensor in self._state_tensors().items()},
+            "generators": {name: generator.get_state() for name, generator in self._generators.items()},
+            "metric_sums": {name: float(total) for name, total in self._sums.items()},
+            "metric_counts": dict(self._counts),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on, bit for bit, from where :meth:`state_dict` was taken of an agent with the same settings.
+
+        Raises:
+            ValueError: If the state is of another agent: names or sizes differ.
+        """
+        tensors = self._state_tensors()
+        given = {name: tuple(tensor.shape) for name, tensor in state["tensors"].items()}
+        wanted = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+        if given != wanted:
+            differing = sorted(name for name in given.keys() | wanted.keys() if given.get(name) != wanted.get(name))
+            raise ValueError(f"the state is of another agent: {', '.join(differing)} differ")
+        for name, tensor in tensors.items():
+            tensor.copy_(state["tensors"][name])
+        for parameters in (self._actor_parameters, self._critic_parameters, self._target_parameters):
+            parameters.refresh()
+        for name, generator in self._generators.items():
+            generator.set_state(state["generators"][name])
+        self._sums, self._counts = dict(state["metric_sums"]), dict(state["metric_counts"])
+
+    def _state_tensors(self) -> dict[str, Tensor]:
+        moments = {
+            f"{name}.{key}": tensor
+            for name, optimizer in self._optimizers.items()
+            for key, tensor in optimizer.tensors().items()
+        }
+        return {
+            "actor": self._actor_parameters.values,
+            "critics": self._critic_parameters.values,
+            "targets": self._target_parameters.values,
+            "log_alpha": self.log_alpha,
+            "alpha": self._alpha,
+            **moments,
+        }
+
+    def _allocate(self, batch_size: int) -> None:
+        self._batch_size = batch_size
+        self._actor_places, self._critic_places = self._actor.allocate(batch_size), self._critics.allocate(batch_size)
+        self._noise = torch.zeros((batch_size, self.networks.dims.action), device=self.device)
+        self._average = array_of(torch.full((batch_size,), 1.0 / batch_size, device=self.device))
+        # What the arithmetic between the networks reads and writes: views that are made once.
+        heads, values = self._actor_places[-1], self._critic_places[-1]
+        self._mean, self._raw = (array_of(part) for part in columns(heads.output, 2))
+        self._of_mean, self._of_raw = (array_of(part) for part in columns(heads.gradient, 2))
+        self._values, self._of_values = (array_of(part)[:, :, 0] for part in (values.output, values.gradient))
+
+    def _draw(self) -> Sample:
+        """Samples from the actor's last output; good until the next call."""
+        noise = self._noise.normal_(generator=self._generators["learning"])
+        return self._policy.sample(self._mean, self._raw, array_of(noise))
+
+    def _update_critics(self, batch: JoinedBatch) -> None:
+        values, alpha = self._values, self._alpha_array
+        self._actor.forward(batch.next_observations, self._actor_places)
+        after = self._draw()
+        room = batch.next_inputs[:, self.networks.dims.observation :]
+        if self._reduced:  # NumPy has no bfloat16
+            room.copy_(tensor_of(after.actions))
+        else:
+            array_of(room)[...] = after.actions
+        self._targets.forward(batch.next_inputs, self._critic_places)
+        soft_value = self._math.minimum(values[0], values[1]) - alpha * after.log_prob
+        # Truncation is not an end: only a terminated transition has no future (reference, section 2).
+        future = self.config.gamma * (1.0 - array_of(batch.terminated)) * soft_value
+        expected = array_of(batch.rewards) + future
+
+        self._critics.forward(batch.inputs, self._critic_places)
+        errors = values - expected
+        # Each critic's loss is the mean of the squared errors.
+        self._of_values[...] = errors * (2.0 / self._batch_size)
+        self._critics.backward(batch.inputs, self._critic_places)
+        self._critic_parameters.collect()
+        self._optimizers["critics"].step()
+        self._critic_parameters.refresh()
+        losses, means = (errors * errors) @ self._average, values @ self._average
+        self._record(critic_loss=losses[0] + losses[1], q_value_1=means[0], q_value_2=means[1])
+
+    def _update_actor_and_temperature(self, observations: Tensor) -> None:
+        updates = self.config.policy_frequency
+        self._critics.share(observations)
+        self._actor.forward(observations, self._actor_places)
+        for remaining in reversed(range(updates)):
+            self._update_actor(observations, self._draw())
+            if self.config.autotune or remaining:
+                # One pass with the new weights serves the temperature and, with noise of its own, the next update.
+                self._actor.forward(observations, self._actor_places)
+            if self.config.autotune:
+                self._update_temperature(self._draw())
+
+    def _update_actor(self, observations: Tensor, sample: Sample) -> None:
+        (first, second), share, alpha = self._values, 1.0 / self._batch_size, self._alpha_array
+        self._critics.forward_actions(tensor_of(sample.actions), self._critic_places)
+        # The loss, mean(alpha log_prob - min(q_1, q_2)), reaches the smaller value; equal ones halve it.
+        reached = share * ((first < second) + 0.5 * (first == second))
+        self._of_values[0] = -reached
+        self._of_values[1] = reached - share
+        of_actions = array_of(self._critics.action_gradient(self._critic_places))
+        self._policy.backward(sample, of_actions, alpha * share, self._of_mean, self._of_raw)
+        self._actor.backward(observations, self._actor_places)
+        self._actor_parameters.collect()
+        self._optimizers["actor"].step()
+        self._actor_parameters.refresh()
+        log_prob, value = sample.log_prob @ self._average, self._math.minimum(first, second) @ self._average
+        self._record(actor_loss=alpha[0] * log_prob - value, entropy=-log_prob)
+
+    def _update_temperature(self, sample: Sample) -> None:
+        loss = -self._alpha_array[0] * (sample.log_prob @ self._average + self.target_entropy)
+        # The loss is linear in alpha, so its derivative by log_alpha is itself.
+        array_of(self._log_alpha_gradient)[...] = loss
+        self._optimizers["log_alpha"].step()
+        torch.exp(self.log_alpha, out=self._alpha)
+        self._record(alpha_loss=loss, alpha=self._alpha_array[0])
+
+    def _record(self, **values: Array) -> None:
+        for name, value in values.items():
+            self._sums[name] = self._sums[name] + value
+            self._counts[name] += 1
+
+
+def _actor_groups(actor: Actor) -> list[Group]:
+    """Mean and log_std read the same hidden layer: one product. Their adapters read one of them each."""
+    layers = dict(actor.layers())
+    groups: list[Group] = [[[layer]] for name, layer in layers.items() if not name.startswith(("mean", "log_std"))]
+    groups.append([[actor.mean, actor.log_std]])
+    if actor.mean_adapter is not None and actor.log_std_adapter is not None:
+        groups.append([[actor.mean_adapter], [actor.log_std_adapter]])
+    return groups
+
+
+def _critic_groups(critics: Sequence[Critic]) -> list[Group]:
+    return [[[layer] for _, layer in twins] for twins in zip(*(critic.layers() for critic in critics), strict=True)]
+
+
+def _relus(network: Trunk) -> list[bool]:
+    """Whether ReLU follows, for each group of layers in the order of their application."""
+    adapter = [network.adapter_relu] if network.input_adapter is not None else []
+    return adapter + [not head for head in _heads(network)[len(adapter) :]]
+
+
+def _heads(network: Trunk) -> list[bool]:
+    """Whether it belongs to the head, which has no ReLU, for each group of layers in the order of their application."""
+    trunk = (network.input_adapter is not None) + 1 + len(network.hidden_names)
+    heads = 2 if isinstance(network, Actor) and network.mean_adapter is not None else 1
+    return [False] * trunk + [True] * heads

@@ -1,0 +1,1 @@
+"""What a finished run learned: episodes of its policy, and films of them."""

@@ -1,0 +1,155 @@
+"""Evaluates the policy of a finished run, films it, and draws an environment."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+
+from acmr.config import ConfigError, EnvConfig
+from acmr.evaluation.camera import is_robot, make_camera
+from acmr.evaluation.rollout import Episode, VideoOptions, play, render_mode
+from acmr.settings.compose import environment_config
+from acmr.storage.durable import write_bytes
+from acmr.storage.run_dir import RunDir
+from acmr.transfer.teacher import Teacher, load_teacher
+
+RESULT_FILE = "evaluation.json"
+#: Where a still is seen from, in degrees, and how close, relative to the camera that follows a robot.
+_STILL_AZIMUTH, _STILL_CLOSENESS = 150.0, 0.85
+
+
+def load_run(path: Path) -> tuple[Teacher, EnvConfig]:
+    """The final networks of a finished run, and the environment they learned in.
+
+    Raises:
+        ConfigError: If there is no such run, if it is unfinished, or if one of its files is damaged.
+    """
+    run_dir = RunDir(path)
+    if not path.is_dir():
+        raise ConfigError(f"{path}: no such run directory; give one as in runs/quick/ant-none/seed_1")
+    settings = run_dir.stored_settings()
+    if settings is None:
+        raise ConfigError(f"{path}: not a run directory (no config.yaml); give one as in runs/quick/ant-none/seed_1")
+    if not run_dir.is_complete():
+        raise ConfigError(f"{path}: this run is not finished; start it again with the command that began it")
+    try:
+        config = EnvConfig(**settings["env"])
+    except (KeyError, TypeError) as error:
+        raise ConfigError(f"{run_dir.config_file}: damaged, its part env cannot be used ({error})") from error
+    return load_teacher(path), config
+
+
+def check_fit(teacher: Teacher, config: EnvConfig) -> str | None:
+    """Compares the environment that was learned in with the one that is made here.
+
+    Returns:
+        A remark if the robot has changed since, else None.
+
+    Raises:
+        ConfigError: If the policy cannot act in it.
+    """
+    from acmr.envs import describe
+
+    about, here = teacher.description, describe(config)
+    if (list(here.observation_names), list(here.action_names)) != (about.observation_names, about.action_names):
+        raise ConfigError(
+            f"{teacher.path}: learned with {about.dims}, but {config.name} has {len(here.observation_names)} sensors "
+            f"and {len(here.action_names)} actuators here, or other ones; are config.yaml and the teacher of one run?"
+        )
+    if here.model_hash != about.model_hash:
+        return f"{config.name} is not the robot it was trained on (another version of mujoco or gymnasium?)"
+    return None
+
+
+def report(episodes: Sequence[Episode], **about: Any) -> dict[str, Any]:
+    """What ``evaluation.json`` says; the standard deviation is that of these episodes (divided by their number)."""
+    returns = [episode.episodic_return for episode in episodes]
+    lengths = [episode.episode_length for episode in episodes]
+    velocities = [value for episode in episodes if (value := episode.mean_forward_velocity) is not None]
+    return {
+        **about,
+        "episodes": len(episodes),
+        "mean_return": float(np.mean(returns)),
+        "std_return": float(np.std(returns)),
+        "min_return": float(np.min(returns)),
+        "max_return": float(np.max(returns)),
+        "mean_length": float(np.mean(lengths)),
+        "mean_forward_velocity": float(np.mean(velocities)) if velocities else None,
+        "each": [asdict(episode) for episode in episodes],
+    }
+
+
+def evaluate(given: argparse.Namespace) -> None:
+    """Evaluates a run, prints each episode and writes the result as JSON."""
+    teacher, config = load_run(given.run_dir)
+    remark = check_fit(teacher, config)
+    if remark:
+        print(f"warning: {remark}", file=sys.stderr)
+    actor = teacher.build_networks().actor.eval()
+    episodes = []
+    shot = VideoOptions(given.video, given.seconds, given.width, given.height) if given.video else None
+    for episode in play(
+        actor, config, episodes=given.episodes, seed=given.seed, stochastic=given.stochastic, shot=shot
+    ):
+        episodes.append(episode)
+        end = "terminated" if episode.terminated else "time limit"
+        print(
+            f"episode {len(episodes):>3}  seed {episode.seed:>3}  return {episode.episodic_return:>10,.1f}  "
+            f"length {episode.episode_length:>5}{_velocity(episode.mean_forward_velocity)}  {end}",
+            flush=True,
+        )
+    content = report(
+        episodes,
+        run=str(given.run_dir),
+        environment=config.name,
+        policy="stochastic" if given.stochastic else "deterministic",
+        seed=given.seed,
+        sha256=teacher.description.sha256,
+        same_robot=remark is None,
+    )
+    print(
+        f"mean {content['mean_return']:,.1f}  standard deviation {content['std_return']:,.1f}"
+        f"{_velocity(content['mean_forward_velocity'])}  over {len(episodes)} episodes, {content['policy']} policy"
+    )
+    path = given.out or given.run_dir / RESULT_FILE
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror}); type --out FILE.json") from error
+    print(f"written: {path}")
+
+
+def _velocity(value: float | None) -> str:
+    return "" if value is None else f"  velocity {value:>5.2f} m/s"
+
+
+def still(given: argparse.Namespace) -> None:
+    """Draws the pose that an environment begins with, as a PNG file."""
+    from acmr.envs import make_env
+
+    config = environment_config(given.environment)
+    env = make_env(config, render_mode=render_mode(config))
+    env.reset(seed=0)
+    robot: Any = env.unwrapped
+    if is_robot(env):
+        # Without the noise that a reset adds.
+        robot.set_state(robot.init_qpos, robot.init_qvel)
+    camera = make_camera(env, given.width, given.height, azimuth=_STILL_AZIMUTH, closeness=_STILL_CLOSENESS)
+    picture = camera.frame()
+    camera.close()
+    env.close()
+    try:
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        imageio.imwrite(str(given.out), picture, format="PNG")
+    except OSError as error:
+        raise ConfigError(f"{given.out}: cannot be written ({error.strerror or error})") from error
+    print(f"written: {given.out}")

@@ -1,0 +1,266 @@
+"""One run from its settings to its results: the only place where everything is put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from acmr.agent.precision import MatmulPrecision, choose_products
+from acmr.agent.replay_buffer import ReplayBuffer
+from acmr.agent.replay_files import BufferFiles
+from acmr.agent.sac import SAC
+from acmr.config import flatten, is_neutral
+from acmr.envs import make_env
+from acmr.envs.physics import PhysicsWarnings, no_log_file
+from acmr.envs.state import ANYTIME, NEVER, ResumeCheck, rehearse
+from acmr.records import DIVERGED, EpisodeInProgress
+from acmr.run.checkpointing import CheckpointKey, Checkpoints, CheckpointSchedule
+from acmr.run.preparation import Prepared, arrays_bytes, check_space, prepare
+from acmr.run.reproducibility import fingerprint
+from acmr.run.run_logs import Recorder, RunLogs
+from acmr.run.run_state import RunState
+from acmr.run.stop_signals import StopSignals
+from acmr.run.summary import describe_teacher, reached, summarize
+from acmr.run.trainer import DivergedError, Trainer
+from acmr.settings.run_spec import RunSpec
+from acmr.storage.checkpoint_store import SnapshotStore
+from acmr.storage.durable import StorageError, WriteError
+from acmr.storage.run_dir import RunDir, RunHeldError, holds_run
+from acmr.tracking.mirror import replay
+from acmr.tracking.progress import RunProgress, make_progress
+from acmr.tracking.status_file import Heartbeat
+from acmr.tracking.wandb_tracker import Tracker, labels, make_tracker
+from acmr.transfer.teacher import save_teacher
+
+
+def run_experiment(spec: RunSpec, say: Callable[[str], None] = print) -> dict[str, Any]:
+    """Trains what ``spec`` describes, from where it was left, unless that has been done.
+
+    Args:
+        spec: The run.
+        say: Where lines for the user go.
+
+    Returns:
+        The run's summary, as in ``summary.json``; its ``status`` is ``complete`` or ``diverged``.
+
+    Raises:
+        ConfigError: If the run cannot be made; its ``exit_code`` says of which kind that is.
+        Stopped: If the run was asked to stop (a ``SystemExit``).
+    """
+    run_dir, config = RunDir(spec.directory), spec.config
+    done = _finished(spec, run_dir, say)
+    if done is not None:
+        return done
+    torch.set_num_threads(config.threads)
+    prepared = prepare(spec)
+    products = choose_products(config.agent, config.device)
+    rehearsal = rehearse(lambda: make_env(config.env))
+    check_space(config, prepared.networks, run_dir.path, run_dir.checkpoint_folder)
+    try:
+        with run_dir.lock(), run_dir.log(say) as say:
+            # While this process prepared itself, another may have finished the run.
+            done = _finished(spec, run_dir, say)
+            if done is not None:
+                return done
+            with StopSignals() as stop, no_log_file():
+                return Session(prepared, rehearsal, products, run_dir, stop, say).run()
+    except WriteError as error:
+        raise StorageError(run_dir.path, error) from error
+
+
+def exit_code(summary: dict[str, Any]) -> int:
+    """What a process that made a run ends with: 0, or 3 if it diverged."""
+    return 3 if summary["status"] == DIVERGED else 0
+
+
+def _finished(spec: RunSpec, run_dir: RunDir, say: Callable[[str], None]) -> dict[str, Any] | None:
+    if not holds_run(run_dir, spec.config):
+        return None
+    summary = run_dir.summary()
+    if summary is not None and summary.get("status") == DIVERGED:
+        say(f"{run_dir}: diverged at step {summary.get('step')} ({summary.get('cause')}); force=true runs it anew")
+        return summary
+    if not run_dir.is_complete() or summary is None:
+        return None
+    if run_dir.checkpoint_folder.exists():
+        # It was killed between its last two acts.
+        with suppress(RunHeldError, WriteError), run_dir.lock():
+            SnapshotStore(run_dir.checkpoint_folder, 0).clear()
+    say(f"{run_dir}: complete already{reached(summary)}; force=true runs it anew")
+    return summary
+
+
+@dataclass
+class Session:
+    """One process's work on a run that it holds."""
+
+    prepared: Prepared
+    rehearsal: ResumeCheck
+    products: MatmulPrecision
+    run_dir: RunDir
+    stop: StopSignals
+    say: Callable[[str], None]
+
+    def run(self) -> dict[str, Any]:
+        """Trains to the end, and stores what came of it."""
+        for line in [f"run: {self.run_dir}", *self.prepared.report.lines()]:
+            self.say(line)
+        state, checkpoints = self.build()
+        try:
+            self._start(checkpoints, state)
+            return self._train(checkpoints, state)
+        except WriteError as error:
+            raise StorageError(self.run_dir.path, error, checkpoints.latest) from error
+        finally:
+            state.logs.close()
+            state.trainer.env.close()
+
+    def build(self) -> tuple[RunState, Checkpoints]:
+        """Makes the parts of the run as they are before its first step; touches no disk."""
+        prepared, config, folder = self.prepared, self.prepared.spec.config, self.run_dir.checkpoint_folder
+        dims, streams, about = prepared.networks.dims, prepared.streams, prepared.about
+        env = PhysicsWarnings(make_env(config.env))
+        trainer = Trainer(
+            env=env,
+            agent=SAC(
+                prepared.networks, config.agent, streams.acting, streams.learning, prepared.log_alpha, config.device
+            ),
+            buffer=ReplayBuffer(config.agent.buffer_size, dims.observation, dims.action, config.device),
+            streams=streams,
+            total_timesteps=config.total_timesteps,
+            log_every=config.log_every,
+            episode=EpisodeInProgress(about.reward_terms, about.has_forward_velocity),
+        )
+        state = RunState(trainer, env.counts, RunLogs(self.run_dir, about), BufferFiles(folder, trainer.buffer))
+        store = SnapshotStore(folder, arrays_bytes(prepared.networks))
+        return state, Checkpoints(store, state, self._conditions())
+
+    def _start(self, checkpoints: Checkpoints, state: RunState) -> None:
+        spec, run_dir, trainer = self.prepared.spec, self.run_dir, state.trainer
+        if not spec.config.force and checkpoints.load(self.say) is not None:
+            self.say(f"{run_dir}: resumed at step {trainer.global_step:,} of {trainer.total_timesteps:,}")
+        else:
+            if run_dir.config_file.exists():
+                why = "run anew" if spec.config.force else "it had no checkpoint yet"
+                self.say(f"{run_dir}: {why}; starting from the first step")
+            checkpoints.clear()
+            run_dir.start(spec.settings)
+            state.logs.begin()
+        if not run_dir.transfer_file.exists():
+            run_dir.write_json(run_dir.transfer_file, asdict(self.prepared.report))
+        if self.rehearsal.when != ANYTIME and spec.config.checkpoint_every != 0:
+            made = "not be stored: no checkpoints are made, and a run that was stopped begins anew"
+            if self.rehearsal.when != NEVER:
+                made = "be stored between episodes only: checkpoints wait for the end of one"
+            self.say(f"{run_dir}: the state of {spec.config.env.name} can {made}")
+
+    def _train(self, checkpoints: Checkpoints, state: RunState) -> dict[str, Any]:
+        spec, trainer, run_dir = self.prepared.spec, state.trainer, self.run_dir
+        heartbeat = Heartbeat(run_dir.path, spec.config.total_timesteps, trainer.global_step)
+        tracker = _tracker(spec, self.say)
+        replay(tracker, run_dir.path)
+        recorder = Recorder(state.logs, tracker, _progress(spec, trainer.global_step), heartbeat)
+        keeper = CheckpointSchedule(
+            checkpoints, state, spec.config.checkpoint_every, self.rehearsal.when, self.stop, self.say
+        )
+
+        def after_step(global_step: int) -> None:
+            recorder.step(global_step)
+            keeper.after_step(global_step)
+
+        trainer.on_step, trainer.on_episode, trainer.on_metrics = after_step, recorder.episode, recorder.metrics
+        summary: dict[str, Any] | None = None
+        try:
+            state.start_clock()
+            made = self._summary(checkpoints, state, _train(trainer))
+            if made["status"] != DIVERGED:
+                description = describe_teacher(spec, self.prepared.about, trainer.agent, made)
+                save_teacher(run_dir.path, trainer.agent.networks, description)
+            # Last: a run with a summary is finished.
+            run_dir.write_json(run_dir.summary_file, made)
+            summary = made
+        finally:
+            recorder.close(summary)
+        if summary["physics_warnings"]:
+            counts = ", ".join(f"{count:,} x {kind}" for kind, count in summary["physics_warnings"].items())
+            self.say(f"{run_dir}: MuJoCo warned of the simulation: {counts}")
+        if summary["status"] == DIVERGED:
+            last = f"; the checkpoint of step {checkpoints.latest:,} is kept" if checkpoints.latest else ""
+            self.say(f"{run_dir}: diverged at step {summary['step']:,}: {summary['cause']}{last}")
+        else:
+            self._remove(checkpoints)
+            speed = f"{summary['steps_per_second']:.0f} steps per second"
+            self.say(f"{run_dir}: complete{reached(summary)}, {speed}")
+        return summary
+
+    def _remove(self, checkpoints: Checkpoints) -> None:
+        try:
+            checkpoints.clear()
+        except WriteError as error:
+            self.say(f"warning: the checkpoints of this finished run are still there ({error}); remove them")
+
+    def _summary(
+        self, checkpoints: Checkpoints, state: RunState, diverged: DivergedError | None = None
+    ) -> dict[str, Any]:
+        more = {
+            "matrix_products": asdict(self.products),
+            "physics_warnings": dict(state.warnings),
+            "inexact_resumes": checkpoints.inexact,
+        }
+        return summarize(self.prepared.spec, state.logs.history, state.seconds, diverged) | more
+
+    def _conditions(self) -> CheckpointKey:
+        spec, report = self.prepared.spec, asdict(self.prepared.report)
+        settings = {
+            key: value
+            for key, value in flatten(spec.settings).items()
+            if not is_neutral(key) and key != "transfer.teacher"
+        }
+        # One teacher may be reached by several paths; its hash says which it is.
+        teacher = {**(report["teacher"] or {}), "path": None}
+        return CheckpointKey(
+            run={"settings": settings, "transfer": {**report, "teacher": teacher}},
+            fingerprint=fingerprint(spec.config.threads, spec.config.device, self.rehearsal.trace),
+            command=lambda: spec.command,
+            mode=spec.config.resume,
+        )
+
+
+def _train(trainer: Trainer) -> DivergedError | None:
+    """Trains to the end; returns what ended it before."""
+    try:
+        trainer.train()
+    except DivergedError as error:
+        return error
+    return None
+
+
+def _tracker(spec: RunSpec, say: Callable[[str], None]) -> Tracker:
+    config = spec.config
+    return make_tracker(
+        config.tracking,
+        output_dir=Path(config.output_dir),
+        run_name=spec.name,
+        profile=config.profile,
+        seed=config.seed,
+        settings=spec.settings,
+        warn=say,
+        **labels(spec.settings, spec.name, spec.cell),
+    )
+
+
+def _progress(spec: RunSpec, start_step: int) -> RunProgress:
+    config = spec.config
+    return make_progress(
+        config.progress,
+        total_timesteps=config.total_timesteps,
+        threshold=config.threshold,
+        consecutive=config.consecutive,
+        title=" ".join([*([spec.cell] if spec.cell else []), spec.name, f"seed {config.seed}"]),
+        start_step=start_step,
+    )

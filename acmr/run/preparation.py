@@ -1,0 +1,152 @@
+"""What a run starts with, made and checked before anything is written."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+
+from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.replay_files import replay_bytes
+from acmr.config import ConfigError, EnvConfig, ExperimentConfig
+from acmr.envs import EnvDescription, describe, make_env
+from acmr.records import TENSOR_FILE
+from acmr.run.random_streams import RandomStreams, random_streams
+from acmr.settings.run_spec import RunSpec, teacher_spec
+from acmr.storage.checkpoint_store import KEPT
+from acmr.storage.run_dir import RunDir
+from acmr.transfer.methods import NONE, TransferReport, transfer
+from acmr.transfer.teacher import Teacher, load_teacher
+
+#: Logs, settings and whatever is small, in bytes.
+_SMALL = 1 << 20
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """All that a run needs and that could be wrong, made and checked before anything is written."""
+
+    spec: RunSpec
+    about: EnvDescription
+    networks: Networks
+    report: TransferReport
+    log_alpha: float
+    streams: RandomStreams
+
+
+def prepare(spec: RunSpec) -> Prepared:
+    """Builds the networks that a run starts with, with everything its teacher gives."""
+    config = spec.config
+    _check_device(config.device)
+    about = describe(config.env)
+    dims = Dimensions(len(about.observation_names), len(about.action_names))
+    teacher = find_teacher(config, dims)
+    streams = random_streams(config.seed, config.device)
+    low, high = _action_bounds(config.env)
+    fresh = Networks(dims, config.agent.hidden_sizes, low, high, streams.networks)
+    networks, report = transfer(fresh, teacher, config.transfer, config.freeze, streams.networks)
+    copied_alpha = teacher is not None and config.transfer.copy_log_alpha
+    log_alpha = teacher.description.log_alpha if teacher is not None and copied_alpha else 0.0
+    return Prepared(spec, about, networks, report, log_alpha, streams)
+
+
+def _action_bounds(config: EnvConfig) -> tuple[np.ndarray, np.ndarray]:
+    env = make_env(config)
+    env.close()
+    assert isinstance(env.action_space, Box)
+    return env.action_space.low, env.action_space.high
+
+
+def find_teacher(config: ExperimentConfig, dims: Dimensions) -> Teacher | None:
+    """Loads the teacher that the settings name or imply.
+
+    Raises:
+        ConfigError: If there is none, with the command that trains it.
+    """
+    if config.transfer.name == NONE:
+        return None
+    if config.transfer.teacher is not None:
+        return load_teacher(config.transfer.teacher)
+    source = teacher_spec(config)
+    if config.transfer.name == "direct":
+        _check_same_body(source.config, dims)
+    path = source.directory / TENSOR_FILE
+    if not RunDir(source.directory).is_complete():
+        state = "is not finished" if RunDir(source.directory).stored_settings() else "does not exist"
+        raise ConfigError(
+            f"transfer={config.transfer.name}: the teacher's run {source.directory} {state}; "
+            f"train it with: {source.command} (or give another one: transfer.teacher=PATH)"
+        )
+    return load_teacher(path)
+
+
+def _check_same_body(source: ExperimentConfig, dims: Dimensions) -> None:
+    about = describe(source.env)
+    theirs = Dimensions(len(about.observation_names), len(about.action_names))
+    if theirs != dims:
+        raise ConfigError(
+            f"transfer=direct: the source environment {source.env.name} has {theirs}, this one {dims}; "
+            "type transfer=hidden or transfer=expand between different bodies"
+        )
+
+
+def _check_device(device: str) -> None:
+    try:
+        kind = torch.device(device).type
+    except RuntimeError:
+        raise ConfigError(f"device={device}: must be cpu or cuda") from None
+    if kind not in ("cpu", "cuda"):
+        raise ConfigError(f"device={device}: must be cpu or cuda")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(f"device={device}: no CUDA device is available here; type device=cpu")
+
+
+def arrays_bytes(networks: Networks) -> int:
+    """At most this much do the arrays of one checkpoint take: weights, targets, two moments each, and the rest."""
+    return 5 * 4 * sum(parameter.numel() for parameter in networks.parameters()) + (4 << 20)
+
+
+def space_needed(config: ExperimentConfig, networks: Networks) -> int:
+    """Bytes that a run takes on the disk while it goes on."""
+    weights = 4 * sum(parameter.numel() for parameter in networks.parameters())
+    if config.checkpoint_every == 0:
+        return weights + _SMALL
+    dims, agent = networks.dims, config.agent
+    replay = replay_bytes(agent.buffer_size, config.total_timesteps, dims.observation, dims.action)
+    # One checkpoint more while the oldest is still there; each holds weights, most of their targets, two moments.
+    return replay + (KEPT + 1) * 4 * weights + _SMALL
+
+
+def check_space(config: ExperimentConfig, networks: Networks, run_dir: Path, checkpoint_folder: Path) -> None:
+    """Refuses a run that its disk cannot take.
+
+    Raises:
+        ConfigError: With what it needs and what there is.
+    """
+    place = next((folder for folder in (run_dir, *run_dir.absolute().parents) if folder.is_dir()), Path("/"))
+    needed = space_needed(config, networks)
+    free = shutil.disk_usage(place).free
+    if needed > free + _held(checkpoint_folder):
+        raise ConfigError(
+            f"{run_dir}: takes up to {_size(needed)} while it runs, but its disk has {_size(free)} free; free some, "
+            "type output_dir=FOLDER on another disk, or checkpoint_every=0 (it cannot be resumed then)"
+        )
+
+
+def _held(folder: Path) -> int:
+    total = 0
+    # Another process may be at work there, and remove what is looked at.
+    with suppress(FileNotFoundError, NotADirectoryError):
+        for path in folder.iterdir():
+            with suppress(FileNotFoundError):
+                total += path.lstat().st_size
+    return total
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= 1e8 else f"{count / 1e6:.1f} MB"

@@ -1,0 +1,140 @@
+"""Everything that is told of a run while it goes on: its own files, its W&B mirror and the progress bar."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+from acmr.agent.sac import METRIC_NAMES
+from acmr.envs import EnvDescription
+from acmr.records import EPISODE_COLUMNS, VELOCITY_COLUMN, EpisodeRecord
+from acmr.storage.csv_log import CsvLog
+from acmr.storage.durable import DamagedError, FileDigest
+from acmr.storage.run_dir import RunDir
+from acmr.tracking.progress import RunProgress
+from acmr.tracking.status_file import Heartbeat
+from acmr.tracking.wandb_tracker import Tracker
+
+_METRIC_COLUMNS = ("global_step", "steps_per_second", *METRIC_NAMES)
+
+
+class RunLogs:
+    """``episodes.csv`` and ``metrics.csv``; creating the object touches no disk.
+
+    Args:
+        run_dir: Where they lie.
+        about: What the environment reports.
+
+    Attributes:
+        history: Every episode in ``episodes.csv``.
+    """
+
+    def __init__(self, run_dir: RunDir, about: EnvDescription) -> None:
+        self._run_dir, self._about = run_dir, about
+        velocity = [VELOCITY_COLUMN] if about.has_forward_velocity else []
+        self._columns = [*EPISODE_COLUMNS, *velocity, *about.reward_terms]
+        self._logs: dict[str, CsvLog] = {}
+        self.history: list[EpisodeRecord] = []
+
+    def begin(self) -> None:
+        """Begins both files anew."""
+        self._open({})
+
+    def go_on(self, marks: Mapping[str, FileDigest]) -> None:
+        """Cuts both files back to what they were, and reads the episodes.
+
+        Raises:
+            DamagedError: If one does not begin with what was marked.
+            KeyError: If a mark is missing.
+        """
+        self._open({name: marks[name] for name in ("episodes", "metrics")})
+        self.history = self._read_episodes(self._run_dir.episodes_file)
+
+    def episode(self, record: EpisodeRecord) -> None:
+        """Records an episode that has ended."""
+        self.history.append(record)
+        velocity = [record.mean_forward_velocity] if self._about.has_forward_velocity else []
+        terms = [record.reward_terms[name] for name in self._about.reward_terms]
+        row = [record.global_step, record.episodic_return, record.episode_length, *velocity, *terms]
+        self._logs["episodes"].row(row)
+
+    def metrics(self, global_step: int, values: Mapping[str, float]) -> None:
+        """Records means over the last steps."""
+        self._logs["metrics"].row([global_step, *(values[name] for name in _METRIC_COLUMNS[1:])])
+
+    def marks(self) -> dict[str, FileDigest]:
+        """Waits until every row is on the disk, and says what each file holds."""
+        return {name: log.mark() for name, log in self._logs.items()}
+
+    def close(self) -> None:
+        """Closes both files."""
+        for log in self._logs.values():
+            log.close()
+        self._logs = {}
+
+    def _open(self, marks: Mapping[str, FileDigest]) -> None:
+        self.close()
+        files = {
+            "episodes": (self._run_dir.episodes_file, self._columns),
+            "metrics": (self._run_dir.metrics_file, _METRIC_COLUMNS),
+        }
+        for name, (path, columns) in files.items():
+            self._logs[name] = CsvLog(path, columns, marks.get(name))
+
+    def _read_episodes(self, path: Path) -> list[EpisodeRecord]:
+        with path.open(newline="", encoding="utf-8") as stream:
+            rows = csv.DictReader(stream)
+            if rows.fieldnames != self._columns:
+                raise DamagedError(f"{path}: not the columns of this run")
+            return [self._record(row) for row in rows]
+
+    def _record(self, row: Mapping[str, str]) -> EpisodeRecord:
+        return EpisodeRecord(
+            int(row["global_step"]),
+            float(row["episodic_return"]),
+            int(row["episode_length"]),
+            float(row[VELOCITY_COLUMN]) if self._about.has_forward_velocity else None,
+            {name: float(row[name]) for name in self._about.reward_terms},
+        )
+
+
+class Recorder:
+    """Passes episodes and metrics on as they come.
+
+    Args:
+        logs: The run's own files.
+        tracker: The run's mirror.
+        progress: What the user sees.
+        heartbeat: What others see.
+    """
+
+    def __init__(self, logs: RunLogs, tracker: Tracker, progress: RunProgress, heartbeat: Heartbeat) -> None:
+        self._logs, self._tracker, self._progress, self._heartbeat = logs, tracker, progress, heartbeat
+        for record in logs.history:
+            progress.episode(record)
+            heartbeat.episode(record.episodic_return)
+
+    def step(self, global_step: int) -> None:
+        """Notes one more step."""
+        self._progress.update(global_step)
+        self._heartbeat.step(global_step)
+
+    def episode(self, record: EpisodeRecord) -> None:
+        """Records an episode that has ended."""
+        self._logs.episode(record)
+        self._tracker.episode(record)
+        self._progress.episode(record)
+        self._heartbeat.episode(record.episodic_return)
+
+    def metrics(self, global_step: int, values: Mapping[str, float]) -> None:
+        """Records means over the last steps; ``values`` has ``steps_per_second`` and the learner's own."""
+        self._logs.metrics(global_step, values)
+        self._tracker.metrics(global_step, values)
+
+    def close(self, summary: Mapping[str, object] | None) -> None:
+        """Ends everything; without a summary the run did not come to its end."""
+        self._progress.close()
+        self._heartbeat.close(str(summary["status"]) if summary else "stopped")
+        self._logs.close()
+        self._tracker.finish(summary, 0 if summary else 1)

@@ -1,0 +1,102 @@
+"""What a finished run says of itself, and of the networks it leaves."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from acmr.agent.sac import SAC
+from acmr.envs import EnvDescription
+from acmr.records import COMPLETE, DIVERGED, EpisodeRecord, steps_to_threshold
+from acmr.run.reproducibility import git_commit, machine, versions
+from acmr.run.trainer import DivergedError
+from acmr.settings.run_spec import RunSpec
+from acmr.transfer.teacher import FORMAT_VERSION, TeacherDescription
+
+#: Episodes that the final return is the mean of.
+FINAL_EPISODES = 10
+
+
+def summarize(
+    spec: RunSpec, history: Sequence[EpisodeRecord], wall: float, diverged: DivergedError | None = None
+) -> dict[str, Any]:
+    """The content of ``summary.json``.
+
+    Args:
+        spec: The run.
+        history: Every episode that ended.
+        wall: Seconds that the training took.
+        diverged: What ended it, if it did not come to its last step.
+    """
+    config = spec.config
+    steps = diverged.step if diverged else config.total_timesteps
+    returns = [record.episodic_return for record in history]
+    met = steps_to_threshold([record.global_step for record in history], returns, config.threshold, config.consecutive)
+    return {
+        "status": DIVERGED if diverged else COMPLETE,
+        **({"step": diverged.step, "cause": diverged.cause} if diverged else {}),
+        "cell": spec.cell,
+        "run": spec.name,
+        "profile": config.profile,
+        "env": config.env.name,
+        "transfer": config.transfer.name,
+        "freeze": config.freeze,
+        "seed": config.seed,
+        "global_step": steps,
+        "total_timesteps": config.total_timesteps,
+        "episodes": len(history),
+        "threshold": config.threshold,
+        "consecutive": config.consecutive,
+        "steps_to_threshold": met.last if met else None,
+        "steps_to_threshold_first": met.first if met else None,
+        "censored": met is None,
+        "final_return": float(np.mean(returns[-FINAL_EPISODES:])) if returns else None,
+        "steps_per_second": steps / wall,
+        "wall_seconds": wall,
+        "versions": versions(),
+        "git_commit": git_commit(),
+        "machine": machine(config.threads, config.device),
+    }
+
+
+def describe_teacher(
+    spec: RunSpec, about: EnvDescription, agent: SAC, summary: Mapping[str, Any]
+) -> TeacherDescription:
+    """What the file of the final networks says of them.
+
+    Args:
+        spec: The run.
+        about: Its environment.
+        agent: The learner at the end.
+        summary: The content of ``summary.json``.
+    """
+    networks = agent.networks
+    return TeacherDescription(
+        format_version=FORMAT_VERSION,
+        environment=spec.config.env.name,
+        environment_id=spec.config.env.id,
+        model_hash=about.model_hash,
+        observation_names=list(about.observation_names),
+        action_names=list(about.action_names),
+        action_low=networks.action_low.tolist(),
+        action_high=networks.action_high.tolist(),
+        hidden_sizes=list(networks.hidden_sizes),
+        core=[networks.core.observation, networks.core.action] if networks.core else None,
+        adapter_activation=networks.adapter_activation,
+        log_alpha=agent.log_alpha.item(),
+        seed=spec.config.seed,
+        profile=spec.config.profile,
+        global_step=spec.config.total_timesteps,
+        final_return=summary["final_return"],
+        config=json.loads(json.dumps(spec.settings)),
+    )
+
+
+def reached(summary: Mapping[str, Any]) -> str:
+    """Whether a run met its threshold, in words that follow on others."""
+    step = summary.get("steps_to_threshold")
+    threshold = f"{summary.get('threshold', float('nan')):g}"
+    return f", return {threshold} reached at step {step:,}" if step else f", return {threshold} not reached"

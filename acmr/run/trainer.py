@@ -1,0 +1,141 @@
+"""The training loop: act, store, learn, record."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from acmr.agent.replay_buffer import ReplayBuffer
+from acmr.agent.sac import SAC
+from acmr.records import EpisodeInProgress, EpisodeRecord
+from acmr.run.random_streams import RandomStreams
+
+
+class DivergedError(Exception):
+    """Numbers are no longer finite, so that nothing can be learned from here on.
+
+    Attributes:
+        step: The step at which this was seen.
+        cause: What is not finite.
+    """
+
+    def __init__(self, step: int, cause: str) -> None:
+        super().__init__(f"diverged at step {step:,}: {cause}")
+        self.step, self.cause = step, cause
+
+
+def _ignore(*_: object) -> None:
+    """Does nothing with what it is told."""
+
+
+@dataclass
+class Trainer:
+    """Trains one agent in one environment.
+
+    Attributes:
+        env: The environment, with its time limit.
+        agent: The learner.
+        buffer: Replay memory.
+        streams: Random numbers of the run.
+        total_timesteps: Environment steps to take.
+        log_every: Environment steps between two rows of metrics.
+        episode: Sums over the current episode.
+        on_step: Called when all of a step is done, with its number; what it raises ends the training.
+        on_episode: Called as each episode ends.
+        on_metrics: Called with the step, and means since the last call, ``steps_per_second`` among them.
+        global_step: Environment steps taken.
+        observation: What the next action answers; None between two episodes.
+    """
+
+    env: gym.Env[np.ndarray, np.ndarray]
+    agent: SAC
+    buffer: ReplayBuffer
+    streams: RandomStreams
+    total_timesteps: int
+    log_every: int
+    episode: EpisodeInProgress
+    on_step: Callable[[int], None] = _ignore
+    on_episode: Callable[[EpisodeRecord], None] = _ignore
+    on_metrics: Callable[[int, dict[str, float]], None] = _ignore
+    global_step: int = 0
+    observation: np.ndarray | None = None
+
+    def train(self) -> None:
+        """Runs from the step that was reached to the last.
+
+        Raises:
+            DivergedError: If a number that must be finite is not.
+        """
+        since = (time.perf_counter(), self.global_step)
+        while self.global_step < self.total_timesteps:
+            self._step()
+            if self.global_step % self.log_every == 0:
+                now, (before, first) = time.perf_counter(), since
+                since = (now, self.global_step)
+                self._log((self.global_step - first) / (now - before))
+            self.on_step(self.global_step)
+        self._check_learner()
+
+    def _step(self) -> None:
+        config, observation = self.agent.config, self.observation
+        if observation is None:
+            # Later resets go on with the generator that the first one seeds.
+            observation, _ = self.env.reset(seed=None if self.global_step else self.streams.environment)
+            self._check("an observation", observation)
+        self.global_step += 1
+        exploring = self.global_step <= config.learning_starts
+        action = self._random_action() if exploring else self.agent.act(observation)
+        self._check("the policy's action", action)
+        next_observation, reward, terminated, truncated, info = self.env.step(action)
+        reward, ended = float(reward), terminated or truncated
+        self._check("an observation", next_observation)
+        self._check("a reward", reward)
+        self.episode.step(reward, info)
+        self.buffer.add(observation, action, reward, next_observation, terminated, ended)
+        self.observation = next_observation
+        if ended:
+            self.on_episode(self.episode.record(self.global_step))
+            self.episode.restart()
+            self.observation = None
+        if not exploring:
+            self.agent.update(self.buffer.sample(config.batch_size, self.streams.replay), self.global_step)
+
+    def _log(self, speed: float) -> None:
+        metrics = self.agent.metrics()
+        self.on_metrics(self.global_step, {"steps_per_second": speed, **metrics})
+        if self.global_step > self.agent.config.learning_starts:
+            self._check("the critics' loss", metrics["critic_loss"])
+        self._check_learner()
+
+    def _check(self, what: str, values: np.ndarray | float) -> None:
+        # A sum is quicker than a look at each number, and finite only if they all are, or nearly so.
+        total = values if isinstance(values, float) else float(values.sum())
+        if not math.isfinite(total) and not np.isfinite(values).all():
+            raise DivergedError(self.global_step, f"{what} is not finite")
+
+    def _check_learner(self) -> None:
+        if not is_finite(self.agent):
+            raise DivergedError(self.global_step, "the learner's weights are not finite")
+
+    def _random_action(self) -> np.ndarray:
+        space = self.env.action_space
+        assert isinstance(space, gym.spaces.Box)
+        return self.streams.exploration.uniform(space.low, space.high).astype(np.float32)
+
+
+def is_finite(agent: SAC) -> bool:
+    """Whether all weights, targets, moments and sums of a learner are finite."""
+    state = agent.state_dict()
+    sums = all(map(math.isfinite, state["metric_sums"].values()))
+    return sums and all(map(_all_finite, state["tensors"].values()))
+
+
+def _all_finite(tensor: torch.Tensor) -> bool:
+    # As with the trainer's checks: a finite sum has finite terms, and is quicker to come by.
+    return math.isfinite(float(tensor.sum())) or bool(torch.isfinite(tensor).all())

@@ -1,0 +1,142 @@
+"""The border to Hydra: composed configs become typed settings, and settings become a run's identity."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import asdict, fields, is_dataclass
+from difflib import get_close_matches
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue
+
+from acmr.config import ConfigError, EnvConfig, ExperimentConfig, flatten, validate
+
+CONFIG_FOLDER = Path(__file__).resolve().parents[2] / "conf"
+
+
+def register_schema() -> None:
+    """Tells Hydra the types of all settings."""
+    ConfigStore.instance().store(name="schema", node=ExperimentConfig)
+
+
+def parse(cfg: DictConfig) -> ExperimentConfig:
+    """Types and validates a composed config.
+
+    Raises:
+        ConfigError: If a value is missing, unknown or not allowed.
+    """
+    try:
+        _refuse_unknown(cfg)
+        config = OmegaConf.to_object(cfg)
+    except (MissingMandatoryValue, InterpolationToMissingValueError) as error:
+        key = str(error).strip().splitlines()[0].rpartition(": ")[2]
+        example = " (for example env.id=Hopper-v5)" if key == "env.id" else ""
+        raise ConfigError(f"{key} has no value: type {key}=VALUE{example}") from error
+    assert isinstance(config, ExperimentConfig)
+    validate(config)
+    return config
+
+
+def compose_config(overrides: Sequence[str]) -> DictConfig:
+    """Composes ``conf/`` with overrides, within a running Hydra application or outside one.
+
+    Files are read once for each choice of groups; values are set on a copy, as Hydra itself does it.
+    """
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    cfg = deepcopy(_composed(tuple(str(entry.input_line) for entry in parsed if _chooses(entry)), CONFIG_FOLDER))
+    ConfigLoaderImpl._apply_overrides_to_config([entry for entry in parsed if not _chooses(entry)], cfg)
+    return cfg
+
+
+def _chooses(override: Override) -> bool:
+    if override.is_sweep_override() or override.is_hydra_override():
+        return True
+    return override.key_or_group in groups() and not isinstance(override.value(), dict)
+
+
+@lru_cache(maxsize=256)
+def _composed(choices: tuple[str, ...], folder: Path) -> DictConfig:
+    if GlobalHydra.instance().is_initialized():
+        return compose("config", overrides=list(choices))
+    register_schema()
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        return compose("config", overrides=list(choices))
+
+
+def _refuse_unknown(node: DictConfig, prefix: str = "") -> None:
+    # A key added with "+" passes Hydra's own check, and would be dropped in silence.
+    typed = OmegaConf.get_type(node)
+    allowed = {known.name for known in fields(typed)} if is_dataclass(typed) else {str(key) for key in node}
+    for entry in node:
+        key = str(entry)
+        if key not in allowed:
+            raise ConfigError(unknown_key(f"{prefix}{key}"))
+        if not OmegaConf.is_missing(node, key) and isinstance(node[key], DictConfig):
+            _refuse_unknown(node[key], f"{prefix}{key}.")
+
+
+def setting_keys() -> list[str]:
+    """Every setting there is, as ``group.key``."""
+    return sorted(flatten(asdict(ExperimentConfig())))
+
+
+def unknown_key(key: str) -> str:
+    """One line on a key that does not exist, with what was probably meant."""
+    keys = setting_keys()
+    leaf = key.split(".")[-1]
+    near = [known for known in keys if known.split(".")[-1] == leaf]
+    near = near or get_close_matches(key, [*keys, *groups()], n=3, cutoff=0.6)
+    near = near or [known for known in keys if get_close_matches(leaf, [known.split(".")[-1]], cutoff=0.75)][:3]
+    hint = f"did you mean {' or '.join(near)}?" if near else "python run.py --help lists all of them"
+    return f"{key}: no such setting; {hint}"
+
+
+def groups() -> list[str]:
+    """The config groups, such as ``env`` and ``transfer``; those of ``matrix`` lie in sweeps."""
+    return sorted({"matrix", *(entry.name for entry in CONFIG_FOLDER.iterdir() if entry.is_dir())} - {"hydra"})
+
+
+@lru_cache(maxsize=256)
+def baseline(profile: str, env: str, env_id: str, transfer: str) -> dict[str, Any]:
+    """The settings, flat, that a profile has for an environment and a transfer where nothing else is said."""
+    overrides = [f"profile={profile}", f"transfer={transfer}", *env_overrides(env, env_id)]
+    return flatten(asdict(parse(compose_config(overrides))))
+
+
+def env_overrides(name: str, env_id: str | None = None) -> list[str]:
+    """What to type for an environment: its name in ``conf/env``, or a Gymnasium id."""
+    if (CONFIG_FOLDER / "env" / f"{name}.yaml").is_file() and name != "gym":
+        return [f"env={name}"]
+    return ["env=gym", f"env.id={as_override(env_id or name)}"]
+
+
+def as_override(value: object) -> str:
+    """A value in Hydra's grammar, quoted where it has to be."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        return "[" + ",".join(as_override(entry) for entry in value) + "]"
+    text = str(value)
+    if re.fullmatch(r"[A-Za-z_./-][A-Za-z0-9_./+-]*", text):
+        return text
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+
+def environment_config(name: str) -> EnvConfig:
+    """The settings of an environment by its name in ``conf/env`` or its Gymnasium id."""
+    return parse(compose_config(env_overrides(name))).env

@@ -1,0 +1,142 @@
+"""Which run the settings mean: its name, its directory, its cell, its teacher, its command line."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from acmr.config import TEACHER_KEYS, ConfigError, ExperimentConfig, flatten, is_neutral
+from acmr.records import CELLS, DESCRIPTION_FILE
+from acmr.settings.compose import as_override, baseline, compose_config, env_overrides, parse
+
+#: Settings that a run's name spells out in its own way.
+_NAMED_KEYS = ("seed", "freeze", "transfer.name", "transfer.teacher", "env.name")
+_MAX_NAME = 120
+_PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,32}")
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """One run: its settings and what follows from them.
+
+    Attributes:
+        config: All settings.
+        changes: Those that change the result and differ from the profile's own.
+        name: Directory name, ``<env>-<transfer>[-frozen][-<key>=<value>...]``.
+        cell: The paper's name of the experiment, if the run is one of its experiments.
+    """
+
+    config: ExperimentConfig
+    changes: dict[str, Any]
+    name: str
+    cell: str | None
+
+    @property
+    def directory(self) -> Path:
+        """Where the run lies."""
+        return Path(self.config.output_dir) / self.config.profile / self.name / f"seed_{self.config.seed}"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All settings as plain data."""
+        return asdict(self.config)
+
+    @property
+    def command(self) -> str:
+        """The shortest command line that makes this run."""
+        return " ".join(["python run.py", *_short_overrides(self)])
+
+
+def specify(config: ExperimentConfig) -> RunSpec:
+    """Finds out which run the settings mean."""
+    changes = _changes(config)
+    parts = [_safe(config.env.name), config.transfer.name]
+    if config.freeze:
+        parts.append("frozen")
+    shown = {key.split(".")[-1]: value for key, value in changes.items()}
+    if config.transfer.teacher is not None:
+        shown["teacher"] = _teacher_mark(config.transfer.teacher)
+    suffix = [f"{key}={_short(value)}" for key, value in sorted(shown.items())]
+    name = "-".join([*parts, *suffix])
+    if len(name) > _MAX_NAME:
+        name = "-".join([*parts, _digest(suffix)])
+    cell = None if shown else cell_of(config)
+    return RunSpec(config, changes, name, cell)
+
+
+def cell_of(config: ExperimentConfig) -> str | None:
+    """The paper's experiment with this environment, transfer and freezing, if there is one."""
+    roles = {config.pair.source: "source", config.pair.target: "target"}
+    key = (roles.get(config.env.name), config.transfer.name, config.freeze)
+    return next((cell for cell, cell_key in CELLS.items() if cell_key == key), None)
+
+
+def teacher_spec(config: ExperimentConfig) -> RunSpec:
+    """The run that teaches a student: its source environment, profile, seed, length and network sizes."""
+    overrides = [*env_overrides(config.env.source), f"profile={config.profile}", f"seed={config.seed}"]
+    flat = flatten(asdict(config))
+    overrides += [f"{key}={as_override(flat[key])}" for key in TEACHER_KEYS]
+    overrides.append(f"output_dir={as_override(config.output_dir)}")
+    try:
+        return specify(parse(compose_config(overrides)))
+    except ConfigError as error:
+        raise ConfigError(f"env.source={config.env.source}: no such teacher environment ({error})") from error
+
+
+def _changes(config: ExperimentConfig) -> dict[str, Any]:
+    base = baseline(config.profile, config.env.name, config.env.id, config.transfer.name)
+    now = flatten(asdict(config))
+    changed = {}
+    for key in sorted(set(base) | set(now)):
+        if not is_neutral(key) and key not in _NAMED_KEYS and base.get(key) != now.get(key):
+            changed[key] = now.get(key)
+    return changed
+
+
+def _short_overrides(spec: RunSpec) -> list[str]:
+    config = spec.config
+    default = parse(compose_config([f"profile={config.profile}"]))
+    said = [f"profile={config.profile}"] if config.profile != "paper" else []
+    if config.env.name != default.env.name:
+        said += env_overrides(config.env.name, config.env.id)
+    if config.transfer.name != "none":
+        said.append(f"transfer={config.transfer.name}")
+    if config.freeze:
+        said.append("freeze=true")
+    said += [f"{key}={as_override(value)}" for key, value in spec.changes.items()]
+    if config.transfer.teacher is not None:
+        said.append(f"transfer.teacher={as_override(config.transfer.teacher)}")
+    said.append(f"seed={config.seed}")
+    if config.output_dir != default.output_dir:
+        said.append(f"output_dir={as_override(config.output_dir)}")
+    return said
+
+
+def _teacher_mark(path: str) -> str:
+    given = Path(path)
+    beside = given / DESCRIPTION_FILE if given.is_dir() else given.with_suffix(".json")
+    try:
+        return str(json.loads(beside.read_text(encoding="utf-8"))["sha256"])[:8]
+    except (OSError, ValueError, KeyError, TypeError):
+        # Loading the teacher will say what is wrong with it; until then its path identifies it.
+        return _digest(path)
+
+
+def _short(value: object) -> str:
+    if isinstance(value, list | tuple):
+        text = "+".join(_short(entry) for entry in value) if value else "none"
+    else:
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+    return text if _PLAIN.fullmatch(text) else _digest(value)
+
+
+def _safe(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+
+
+def _digest(value: object) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:8]

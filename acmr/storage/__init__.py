@@ -1,0 +1,1 @@
+"""What survives a crash: durable writes, the run directory and checkpoints."""

@@ -1,0 +1,182 @@
+"""Checkpoints of a running run on disk: which there are, whether they are whole, and how many are kept.
+
+``step_<n>.safetensors`` holds arrays; ``step_<n>.json`` has two lines, the sha256 of the second and what it is about,
+and the state itself as JSON, in which the hash of every other file stands. The latter is written last: a checkpoint
+exists once it has its name. Nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
+
+from acmr.storage.durable import (
+    DamagedError,
+    FileDigest,
+    make_folder,
+    read_marked,
+    read_regular,
+    remove,
+    remove_leftovers,
+    sync_folder,
+    write_bytes,
+)
+
+FORMAT_VERSION = 1
+#: Checkpoints that are kept: should the latest be damaged, there is the one before.
+KEPT = 2
+#: A state larger than this is not one of ours.
+_MAX_STATE_BYTES = 64 << 20
+_STATE = re.compile(r"step_(\d{1,15})\.json")
+_OURS = re.compile(r"(step_\d{1,15}\.(json|safetensors)|segment_\d{1,15}_\d{1,15}\.safetensors)")
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A run at the end of one step.
+
+    Attributes:
+        values: The state as far as JSON holds it.
+        arrays: The rest of it.
+        files: Other files of the checkpoint folder that belong to it, with their marks.
+    """
+
+    values: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    files: dict[str, FileDigest]
+
+    def with_values(self, values: dict[str, Any]) -> Snapshot:
+        """The same arrays and files with other values."""
+        return Snapshot(values, self.arrays, self.files)
+
+
+class SnapshotStore:
+    """The checkpoint folder of a run; creating the object touches no disk.
+
+    Args:
+        folder: The folder.
+        limit: Bytes that the arrays of a checkpoint may take.
+    """
+
+    def __init__(self, folder: Path, limit: int) -> None:
+        self.folder, self._limit = folder, limit
+
+    def steps(self) -> list[int]:
+        """Steps with a checkpoint, whole or not, latest first.
+
+        Raises:
+            DamagedError: If the folder is no folder.
+        """
+        if self.folder.is_symlink() or (self.folder.exists() and not self.folder.is_dir()):
+            raise DamagedError(f"{self.folder}: no folder of this run")
+        matches = [_STATE.fullmatch(path.name) for path in self.folder.iterdir()] if self.folder.exists() else []
+        return sorted((int(match[1]) for match in matches if match), reverse=True)
+
+    def prepare(self) -> None:
+        """Makes the folder, and removes what killed processes left half written."""
+        make_folder(self.folder)
+        remove_leftovers(self.folder)
+
+    def write(self, step: int, snapshot: Snapshot) -> None:
+        """Adds a checkpoint; its other files must be on the disk."""
+        data = save_arrays(snapshot.arrays)
+        write_bytes(self._arrays_file(step), data)
+        content = {
+            "values": snapshot.values,
+            "arrays": _as_json(FileDigest.of(data)),
+            "files": {name: _as_json(mark) for name, mark in snapshot.files.items()},
+        }
+        body = (json.dumps(content) + "\n").encode()
+        write_bytes(self.state_file(step), _head(body) + b"\n" + body)
+
+    def read(self, step: int) -> Snapshot:
+        """Reads a checkpoint; its other files are left to whoever knows what they hold.
+
+        Raises:
+            DamagedError: If it is not as it was written, saying which file.
+        """
+        path = self.state_file(step)
+        head, _, body = read_regular(path, _MAX_STATE_BYTES).partition(b"\n")
+        if head != _head(body):
+            raise DamagedError(f"{path}: does not hold what was written to it")
+        try:
+            content = json.loads(body)
+            mark = _from_json(content["arrays"])
+            files = {name: _from_json(entry) for name, entry in content["files"].items()}
+            values = dict(content["values"])
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise DamagedError(f"{path}: not a checkpoint of this program") from error
+        if mark.size > self._limit or not all(_OURS.fullmatch(name) for name in files):
+            raise DamagedError(f"{path}: not a checkpoint of this run")
+        try:
+            arrays = load_arrays(read_marked(self._arrays_file(step), mark, whole=True))
+        except (SafetensorError, KeyError, ValueError, TypeError) as error:
+            raise DamagedError(f"{self._arrays_file(step)}: not a safetensors file") from error
+        return Snapshot(values, arrays, files)
+
+    def discard(self, step: int) -> None:
+        """Removes a checkpoint, so that at every moment it is whole or not there."""
+        remove(self.state_file(step))
+        sync_folder(self.folder)
+        remove(self._arrays_file(step))
+
+    def prune(self, files: Mapping[int, Mapping[str, FileDigest]]) -> None:
+        """Removes all but the latest checkpoints, and whatever belongs to none.
+
+        Args:
+            files: The other files of the checkpoints that are to be kept, by step.
+        """
+        for step in self.steps():
+            if step not in files:
+                self.discard(step)
+        kept = {name for names in files.values() for name in names}
+        kept |= {path.name for step in files for path in (self.state_file(step), self._arrays_file(step))}
+        for path in sorted(self.folder.iterdir()):
+            if _OURS.fullmatch(path.name) and path.name not in kept:
+                remove(path)
+
+    def clear(self) -> None:
+        """Removes every checkpoint and, unless something foreign lies in it, the folder."""
+        if not self.folder.is_dir() or self.folder.is_symlink():
+            return
+        for step in self.steps():
+            self.discard(step)
+        remove_leftovers(self.folder)
+        for path in self.folder.iterdir():
+            if _OURS.fullmatch(path.name):
+                remove(path)
+        with suppress(OSError):
+            self.folder.rmdir()
+
+    def state_file(self, step: int) -> Path:
+        """Where the checkpoint of a step begins."""
+        return self.folder / f"step_{step}.json"
+
+    def _arrays_file(self, step: int) -> Path:
+        return self.folder / f"step_{step}.safetensors"
+
+
+def _head(body: bytes) -> bytes:
+    return json.dumps({"format_version": FORMAT_VERSION, "sha256": hashlib.sha256(body).hexdigest()}).encode()
+
+
+def _as_json(mark: FileDigest) -> list[int | str]:
+    return [mark.size, mark.sha256]
+
+
+def _from_json(entry: Any) -> FileDigest:
+    count, sha256 = entry
+    if not isinstance(count, int) or not isinstance(sha256, str) or count < 0:
+        raise ValueError("no mark")
+    return FileDigest(count, sha256)

@@ -1,0 +1,231 @@
+"""Every write that must survive a crash goes through here, one small step at a time, so that tests can fail each step.
+
+A file is written whole under another name, reaches the disk, and then takes its name; or it only grows, and what it
+held at some moment is known by length and hash. No link is followed.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import re
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from acmr.config import ConfigError
+
+#: Called with an action and a file before each step; a test may raise OSError here, or end the process.
+hook: Callable[[str, Path], None] | None = None
+
+_CREATE = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+_TEMPORARY = re.compile(r"\..*\.tmp")
+
+#: What to do about an error of the disk.
+_REMEDIES = {
+    errno.ENOSPC: "free some space there",
+    errno.EDQUOT: "free some of your quota there",
+    errno.EFBIG: "raise the limit on the size of files (ulimit -f)",
+    errno.EACCES: "make it writable",
+    errno.EPERM: "make it writable",
+    errno.EROFS: "make it writable",
+    errno.EIO: "see to that disk",
+}
+
+
+class WriteError(Exception):
+    """The disk did not take something. The message says which file and why."""
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        super().__init__(f"cannot write {path} ({error.strerror or error})")
+        self.errno = error.errno
+
+
+class StorageError(ConfigError):
+    """The disk does not take what the run has to store."""
+
+    exit_code = 74
+
+    def __init__(self, run_dir: Path, error: WriteError, latest: int | None = None) -> None:
+        remedy = _REMEDIES.get(error.errno or 0, "mend that")
+        then = f"; it resumes at step {latest:,}" if latest else ""
+        super().__init__(f"{run_dir}: {error}; {remedy}, then run the same command again{then}")
+
+
+class DamagedError(Exception):
+    """A file does not hold what was written to it. The message says which file and what is wrong."""
+
+
+@dataclass(frozen=True)
+class FileDigest:
+    """What a file held at some moment: so many bytes, with this sha256 (hex)."""
+
+    size: int
+    sha256: str
+
+    @staticmethod
+    def of(data: bytes) -> FileDigest:
+        """The mark of a whole content."""
+        return FileDigest(len(data), hashlib.sha256(data).hexdigest())
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Writes a file whole or not at all: whoever reads ``path`` sees the old content or the new one.
+
+    Raises:
+        WriteError: If the disk does not take it; the old content is untouched then.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with _step("create", path):
+            temporary.unlink(missing_ok=True)
+            descriptor = os.open(temporary, _CREATE | os.O_EXCL, 0o644)
+        try:
+            middle = len(data) // 2
+            _write(descriptor, path, data[:middle])
+            _write(descriptor, path, data[middle:])
+            with _step("sync", path):
+                os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        with _step("rename", path):
+            os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder in an existing one.
+
+    Raises:
+        WriteError: If it cannot be made, or if something else has its name, a link included.
+    """
+    with _step("make folder", path):
+        path.mkdir(exist_ok=True)
+        if path.is_symlink():
+            raise OSError("it is a link")
+    sync_folder(path.parent)
+
+
+def remove(path: Path) -> None:
+    """Removes a file if there is one."""
+    with _step("remove", path):
+        path.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes what killed processes had begun to write."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if _TEMPORARY.fullmatch(path.name):
+            remove(path)
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes the names in a folder durable."""
+    with _step("sync folder", folder):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+class Appender:
+    """A file that only grows.
+
+    Args:
+        path: The file.
+        mark: What it is to be cut back to; None: it is begun anew.
+
+    Raises:
+        DamagedError: If it does not begin with what was marked; nothing has been changed then.
+        WriteError: If it cannot be written.
+    """
+
+    def __init__(self, path: Path, mark: FileDigest | None = None) -> None:
+        self._path = path
+        held = b"" if mark is None else read_marked(path, mark)
+        with _step("open", path):
+            self._descriptor = os.open(path, _CREATE | os.O_APPEND, 0o644)
+            os.ftruncate(self._descriptor, len(held))
+        self._hash, self._bytes = hashlib.sha256(held), len(held)
+
+    def append(self, data: bytes) -> None:
+        """Appends; it reaches the disk with the next :meth:`mark`."""
+        _write(self._descriptor, self._path, data)
+        self._hash.update(data)
+        self._bytes += len(data)
+
+    def mark(self) -> FileDigest:
+        """Waits until everything is on the disk, and says what that is."""
+        with _step("sync", self._path):
+            os.fsync(self._descriptor)
+        return FileDigest(self._bytes, self._hash.hexdigest())
+
+    def close(self) -> None:
+        """Closes the file."""
+        os.close(self._descriptor)
+
+
+def read_marked(path: Path, mark: FileDigest, whole: bool = False) -> bytes:
+    """Reads what a mark was made of.
+
+    Args:
+        path: The file.
+        mark: Its mark.
+        whole: Whether the file must hold nothing else.
+
+    Raises:
+        DamagedError: If the file does not begin with that, or is longer though it should not be.
+    """
+    data = read_regular(path, mark.size if whole else None, mark.size)
+    if FileDigest.of(data) != mark:
+        raise DamagedError(f"{path}: does not hold what was written to it")
+    return data
+
+
+def read_regular(path: Path, limit: int | None, count: int = -1) -> bytes:
+    """Reads a regular file, no link.
+
+    Args:
+        path: The file.
+        limit: Bytes it may have; None: any number.
+        count: Bytes to read; -1: all.
+
+    Raises:
+        DamagedError: If it is missing, unreadable, no regular file, or larger.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(descriptor, "rb") as stream:
+            status = os.fstat(descriptor)
+            if not stat.S_ISREG(status.st_mode):
+                raise DamagedError(f"{path}: no regular file")
+            if limit is not None and status.st_size > limit:
+                raise DamagedError(f"{path}: {status.st_size} bytes, at most {limit} expected")
+            return stream.read(min(count, status.st_size) if count >= 0 else -1)
+    except OSError as error:
+        raise DamagedError(f"{path}: {error.strerror or error}") from error
+
+
+def _write(descriptor: int, path: Path, data: bytes) -> None:
+    with _step("write", path):
+        view = memoryview(data)
+        while view:
+            view = view[os.write(descriptor, view) :]
+
+
+@contextmanager
+def _step(action: str, path: Path) -> Iterator[None]:
+    try:
+        if hook is not None:
+            hook(action, path)
+        yield
+    except OSError as error:
+        raise WriteError(path, error) from error

@@ -1,0 +1,222 @@
+"""The directory of one run: its files, who may write them, and whether it is finished."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import platform
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from acmr.config import ConfigError, ExperimentConfig, differing_keys
+from acmr.records import COMPLETE, DESCRIPTION_FILE, TENSOR_FILE
+from acmr.storage.durable import (
+    DamagedError,
+    read_regular,
+    remove,
+    remove_leftovers,
+    sync_folder,
+    write_bytes,
+)
+
+#: Files that a run writes anew when it starts from the beginning; what would make it look finished goes first.
+_RESULTS = (
+    "summary.json",
+    "episodes.csv",
+    "metrics.csv",
+    "transfer.json",
+    TENSOR_FILE,
+    DESCRIPTION_FILE,
+    "evaluation.json",
+)
+#: A settings file or a summary larger than this is not one of ours.
+_MAX_BYTES = 1 << 20
+#: Seconds in which who has just taken a directory must have said so.
+_INTRODUCTION = 5.0
+
+
+class RunHeldError(ConfigError):
+    """Another process is at work on the run."""
+
+    exit_code = 75
+
+
+class RunDir:
+    """Paths and state of a run directory; creating the object touches no disk."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config_file = path / "config.yaml"
+        self.episodes_file = path / "episodes.csv"
+        self.metrics_file = path / "metrics.csv"
+        self.transfer_file = path / "transfer.json"
+        self.summary_file = path / "summary.json"
+        self.log_file = path / "run.log"
+        self.lock_file = path / ".lock"
+        self.checkpoint_folder = path / "checkpoint"
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def summary(self) -> dict[str, Any] | None:
+        """What the finished run says of itself; None if it is not finished."""
+        return self.read_json(self.summary_file)
+
+    def is_complete(self) -> bool:
+        """Whether the run came to its end."""
+        summary = self.summary()
+        return summary is not None and summary.get("status") == COMPLETE
+
+    def stored_settings(self) -> dict[str, Any] | None:
+        """The settings it was started with; None if there are none yet."""
+        if not _is_there(self.config_file):
+            return None
+        try:
+            content = yaml.load(read_regular(self.config_file, _MAX_BYTES), _PlainLoader)
+        except (yaml.YAMLError, ValueError, RecursionError, DamagedError) as error:
+            raise ConfigError(f"{self.config_file}: not readable; type force=true to run it anew") from error
+        return content if isinstance(content, dict) else {}
+
+    def start(self, settings: Mapping[str, Any]) -> None:
+        """Clears what an unfinished or repeated run left, and stores the settings."""
+        for name in _RESULTS:
+            remove(self.path / name)
+        # Nothing of the old run may come back once the new one has begun.
+        sync_folder(self.path)
+        write_bytes(self.config_file, yaml.safe_dump(dict(settings), sort_keys=False).encode())
+
+    def read_json(self, path: Path) -> dict[str, Any] | None:
+        """Reads one of the run's JSON files; None if there is none.
+
+        Raises:
+            ConfigError: If it cannot be read.
+        """
+        if not _is_there(path):
+            return None
+        try:
+            content = json.loads(read_regular(path, _MAX_BYTES))
+        except (ValueError, RecursionError, DamagedError) as error:
+            raise ConfigError(f"{path}: damaged ({error}); type force=true to run it anew") from error
+        return content if isinstance(content, dict) else None
+
+    def write_json(self, path: Path, content: Mapping[str, Any]) -> None:
+        """Writes a JSON file whole or not at all."""
+        write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
+
+    @contextmanager
+    def log(self, say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
+        """Says lines to the user, and keeps each in ``run.log`` with its time, as long as the disk takes it."""
+
+        def both(line: str) -> None:
+            with suppress(OSError):
+                os.write(descriptor, f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n".encode())
+            say(line)
+
+        descriptor = self._open(self.log_file, os.O_WRONLY | os.O_APPEND)
+        try:
+            yield both
+        finally:
+            os.close(descriptor)
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Holds the directory for this process, and frees it however the process ends.
+
+        Raises:
+            RunHeldError: If another process holds it, saying which.
+            ConfigError: If the directory cannot be made.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise self._refused(error) from error
+        descriptor = self._open(self.lock_file, os.O_RDWR)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise RunHeldError(f"{self.path}: held by {_holder(descriptor)}; wait for it or end it") from None
+            holder = f"process {os.getpid()} on {platform.node()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n"
+            try:
+                os.ftruncate(descriptor, 0)
+                os.pwrite(descriptor, holder.encode(), 0)
+                remove_leftovers(self.path)
+            except OSError as error:
+                raise self._refused(error) from error
+            yield
+        finally:
+            os.close(descriptor)
+
+    def _open(self, path: Path, flags: int) -> int:
+        try:
+            return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+        except OSError as error:
+            raise self._refused(error) from error
+
+    def _refused(self, error: OSError) -> ConfigError:
+        return ConfigError(
+            f"{self.path}: cannot be written ({error.strerror}); free or unlock it, or type output_dir=FOLDER"
+        )
+
+
+def holds_run(run_dir: RunDir, config: ExperimentConfig) -> bool:
+    """Whether the run that the settings mean has been begun in a directory, and is not to be replaced.
+
+    Raises:
+        ConfigError: If the directory holds a run with other settings.
+    """
+    stored = None if config.force else run_dir.stored_settings()
+    if stored is None:
+        return False
+    differing = differing_keys(stored, config)
+    if differing:
+        raise ConfigError(
+            f"{run_dir}: holds a run with other settings ({', '.join(differing)}); "
+            "type output_dir=FOLDER for another place, or force=true to replace it"
+        )
+    return True
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Loads plain data without aliases, with which a small file can describe an enormous tree."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("aliases are not allowed")
+        return super().compose_node(parent, index)
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return os.path.lexists(path)
+    except (OSError, ValueError):
+        return False
+
+
+def _holder(descriptor: int) -> str:
+    """Who holds a lock; its holder may be about to say so, and what its predecessor said may still stand there."""
+    deadline = time.monotonic() + _INTRODUCTION
+    while time.monotonic() < deadline:
+        said = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
+        match = re.match(r"process ([1-9]\d{0,8}) on (\S+) since", said)
+        if match and (match[2] != platform.node() or _is_alive(int(match[1]))):
+            return said
+        time.sleep(0.02)
+    return "another process"
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True

@@ -1,0 +1,1 @@
+"""Observers of a run: Weights & Biases, progress and the status file."""

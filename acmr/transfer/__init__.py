@@ -1,0 +1,1 @@
+"""What a student takes from its teacher: the methods, and the teacher's file."""

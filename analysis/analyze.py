@@ -1,0 +1,109 @@
+"""From a set of runs to all numbers of the analysis, before anything is written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pandas as pd
+
+from acmr.records import CELLS
+from analysis.loading.load import InputError, RunSet
+from analysis.loading.missing import Missing, missing_runs, planned_seeds
+from analysis.statistics.comparisons import check_reference, compare_cells, compare_groups
+from analysis.statistics.metrics import measure
+from analysis.statistics.summaries import cell_table
+
+#: The paper's threshold and count (section 4.2), for runs that do not say theirs.
+PAPER_THRESHOLD, PAPER_CONSECUTIVE = 4900.0, 5
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """All numbers, before anything is written.
+
+    Attributes:
+        data: The runs.
+        measured: The runs with their metrics.
+        cells: Steps to threshold by group.
+        table3: The paper's comparisons.
+        others: The comparisons of groups that are no cells.
+        missing: Runs of the matrix that are not there.
+    """
+
+    data: RunSet
+    threshold: float
+    consecutive: int
+    reference: str
+    measured: pd.DataFrame
+    cells: pd.DataFrame
+    table3: pd.DataFrame
+    others: pd.DataFrame
+    missing: list[Missing]
+
+    @property
+    def planned(self) -> int:
+        """Seeds that a cell is planned to have."""
+        return len(planned_seeds(self.data.runs))
+
+    @property
+    def planned_runs(self) -> int:
+        """Runs of the whole matrix."""
+        return len(CELLS) * self.planned
+
+    @property
+    def comparisons(self) -> pd.DataFrame:
+        """Rows of table 3 and of the other groups."""
+        return pd.concat([self.table3, self.others], ignore_index=True) if len(self.others) else self.table3
+
+
+def analyze(
+    data: RunSet, threshold: float | None = None, consecutive: int | None = None, reference: str = "A0"
+) -> Analysis:
+    """All numbers of a set of runs.
+
+    Args:
+        data: The runs.
+        threshold: Return to reach; None: the runs' own.
+        consecutive: Episodes in a row; None: the runs' own.
+        reference: Group in A0's place.
+
+    Raises:
+        InputError: If the runs differ in their thresholds and none is given, or the reference is not there.
+    """
+    check_reference(reference, data.groups)
+    limit = threshold if threshold is not None else _common(data, "threshold", PAPER_THRESHOLD)
+    count = consecutive if consecutive is not None else int(_common(data, "consecutive", PAPER_CONSECUTIVE))
+    measured = measure(data, limit, count)
+    planned = len(planned_seeds(data.runs))
+    return Analysis(
+        data=data,
+        threshold=limit,
+        consecutive=count,
+        reference=reference,
+        measured=_check_summaries(measured, threshold is None and consecutive is None),
+        cells=cell_table(measured, data.groups),
+        table3=compare_cells(measured, reference, planned),
+        others=compare_groups(measured, reference, planned),
+        missing=missing_runs(data),
+    )
+
+
+def _common(data: RunSet, name: str, default: float) -> float:
+    values = sorted(set(data.runs[name].dropna()))
+    if len(values) > 1:
+        said = ", ".join(f"{value:g}" for value in values)
+        raise InputError(f"{data.root}: the runs' own {name} differs ({said}); give one, as in --{name} {values[0]:g}")
+    return float(values[0]) if values else default
+
+
+def _check_summaries(measured: pd.DataFrame, own: bool) -> pd.DataFrame:
+    """Says so where a run's summary tells other steps to threshold than its episodes do."""
+    if not own:
+        return measured
+    told = measured["steps_in_summary"]
+    odd = told.notna() & (told != measured["steps_to_threshold"])
+    for name in measured.index[odd]:
+        note = f"summary.json says {told[name]:,.0f} steps to threshold, its episodes say otherwise"
+        reason = measured.loc[name, "reason"]
+        measured.loc[name, "reason"] = f"{reason}; {note}" if reason else note
+    return measured

@@ -1,0 +1,137 @@
+"""Figures with a row for each group: steps to threshold, differences, transfer, cost."""
+
+from __future__ import annotations
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from acmr.records import CELLS
+from analysis.figures.data import MOST_OTHERS, FigureData, FigureSpec
+from analysis.figures.parts import (
+    ROW,
+    count_label,
+    mean_bar,
+    rows,
+    short_name,
+    short_steps,
+    spread,
+    step_axis,
+    two_lines,
+)
+from analysis.figures.style import COLUMN, Palette
+from analysis.statistics.two_samples import mean_interval
+
+_TRANSFER = (
+    "Dots: seeds; lines: means. Initial: the first 10 episodes after the random actions; mean: area under the learning "
+    "curve by its steps; asymptotic: the last tenth of the run (Taylor and Stone, 2009)."
+)
+
+
+def steps_per_seed(data: FigureData, palette: Palette) -> Figure | None:
+    """Steps to threshold of each seed, the mean and its 95% t-interval."""
+    groups = data.present(data.groups)
+    if not groups:
+        return None
+    figure, axes = rows(data, groups)
+    for row, group in enumerate(groups):
+        own, color = data.drawn(group), palette.color(group, data.groups)
+        values = own["steps_to_threshold"].dropna().to_numpy(dtype=float)
+        missed = own.loc[own["censored"], "time"].to_numpy(dtype=float)
+        axes.plot(values, spread(row, len(values)), "o", color=color, markersize=4, alpha=0.85, markeredgecolor="white")
+        if len(missed):
+            style = {"color": color, "markersize": 4.5, "fillstyle": "none", "clip_on": False}
+            axes.plot(missed, spread(row, len(missed)), ">", **style)
+        if len(values) and not len(missed):
+            mean_bar(axes, row, float(values.mean()), mean_interval(values))
+    axes.set(xlabel="steps to threshold", xlim=(0, data.horizon))
+    step_axis(axes.xaxis)
+    return figure
+
+
+def differences(data: FigureData, palette: Palette) -> Figure | None:
+    """Difference of each comparison with its 95% t-interval; of the restricted means where runs are censored."""
+    table = data.comparisons.dropna(subset=["restricted_difference"])
+    if table.empty:
+        return None
+    figure, axes = plt.subplots(figsize=(COLUMN, 0.6 + ROW * len(table)), layout="constrained")
+    entries = table.to_dict("records")
+    for row, entry in enumerate(entries):
+        color = palette.color(entry["index"], data.groups)
+        if np.isfinite(entry["difference"]):
+            interval = (entry["difference_low"], entry["difference_high"])
+            mean_bar(axes, row, entry["difference"], interval, color=color)
+        else:
+            axes.plot(entry["restricted_difference"], row, "D", color="0.55", markersize=4.5, fillstyle="none")
+    axes.axvline(0, color="black", linewidth=0.8)
+    labels = [two_lines(f"{short_name(entry['index'])} − {short_name(entry['reference'])}") for entry in entries]
+    axes.set_yticks(range(len(table)), labels)
+    axes.set_ylim(len(table) - 0.5, -0.5)
+    reach = 1.15 * float(np.nanmax(np.abs(table[["difference", "restricted_difference"]].to_numpy()))) or 1.0
+    widest = np.nanmax(np.abs(table[["difference_low", "difference_high", "restricted_difference"]].to_numpy()))
+    reach = max(reach, 1.05 * float(min(widest, data.horizon)))
+    axes.set_xlim(-reach, reach)
+    axes.set_xlabel("difference in steps (← index faster, slower →)")
+    step_axis(axes.xaxis)
+    axes.grid(axis="y", visible=False)
+    return figure
+
+
+def transfer_metrics(data: FigureData, palette: Palette) -> Figure | None:
+    """Initial, asymptotic and mean return of each seed."""
+    groups = data.present([*CELLS]) + data.others[:MOST_OTHERS]
+    if not groups:
+        return None
+    names = {"initial_return": "initial", "area_under_curve": "mean", "asymptotic_return": "asymptotic"}
+    figure, grid = plt.subplots(1, 3, figsize=(COLUMN, 0.75 + ROW * len(groups)), sharey=True, layout="constrained")
+    for axes, (column, title) in zip(grid, names.items(), strict=True):
+        for row, group in enumerate(groups):
+            values = data.drawn(group)[column].dropna().to_numpy(dtype=float)
+            color = palette.color(group, data.groups)
+            axes.plot(values, spread(row, len(values)), "o", color=color, markersize=3.5, markeredgecolor="white")
+            axes.plot(values.mean() if len(values) else np.nan, row, "|", color="black", markersize=9)
+        axes.set_title(title, pad=3)
+        axes.xaxis.set_major_locator(MaxNLocator(3))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short_steps(value)))
+        axes.margins(x=0.15)
+    grid[0].set_yticks(range(len(groups)), [two_lines(count_label(data, group)) for group in groups])
+    grid[0].set_ylim(len(groups) - 0.5, -0.5)
+    figure.supxlabel("episodic return", fontsize=7)
+    return figure
+
+
+def wall_clock(data: FigureData, palette: Palette) -> Figure | None:
+    """Wall-clock time of each run."""
+    groups = [group for group in data.present(data.groups) if data.drawn(group)["wall_seconds"].notna().any()]
+    if not groups:
+        return None
+    figure, axes = rows(data, groups)
+    hours = data.runs["wall_seconds"].max() >= 2 * 3600
+    for row, group in enumerate(groups):
+        values = data.drawn(group)["wall_seconds"].dropna().to_numpy(dtype=float) / (3600 if hours else 60)
+        color = palette.color(group, data.groups)
+        axes.barh(row, values.mean(), height=0.6, color=color, alpha=0.35)
+        axes.plot(values, spread(row, len(values)), "o", color=color, markersize=3.5, markeredgecolor="white")
+    axes.set(xlabel=f"wall-clock time of a run ({'hours' if hours else 'minutes'})", xlim=(0, None))
+    return figure
+
+
+FIGURES = (
+    FigureSpec(
+        "steps_per_seed",
+        "Steps to threshold of each seed",
+        "Dots: seeds; open triangles: runs that ended without reaching it; bar and line: mean and its 95% t-interval, "
+        "where every seed reached it.",
+        steps_per_seed,
+    ),
+    FigureSpec(
+        "differences",
+        "Difference to the reference",
+        "Index less reference with the 95% t-interval of the difference; open gray diamonds: difference of the "
+        "restricted means, where a run never reached the threshold.",
+        differences,
+    ),
+    FigureSpec("transfer_metrics", "Initial, mean and asymptotic return", _TRANSFER, transfer_metrics, limited=True),
+    FigureSpec("wall_clock", "Cost", "Wall-clock time of each run (dots) and the mean (bars).", wall_clock),
+)

@@ -1,0 +1,86 @@
+"""What the numbers can and cannot show, in words."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from analysis.statistics.comparisons import FAMILY, LARGE_EFFECT
+from analysis.statistics.two_samples import ALPHA, detectable_effect, power, smallest_permutation_p
+
+
+def about_n(table3: pd.DataFrame) -> list[str]:
+    """What the number of runs allows, for the smallest comparison that there is.
+
+    Args:
+        table3: Rows with ``runs_reference`` and ``runs_index``.
+    """
+    sizes = [(int(a), int(b)) for a, b in zip(table3["runs_reference"], table3["runs_index"], strict=True) if a and b]
+    if not sizes:
+        return ["No two groups have complete runs yet: nothing can be compared."]
+    n, m = min(sizes, key=lambda pair: (sum(pair), pair))
+    if min(n, m) < 2:
+        return [
+            f"The smallest comparison has {n} against {m} runs. One run says nothing about how much runs differ: no "
+            "test is made, and a difference of the means may be chance entirely."
+        ]
+    least = smallest_permutation_p(n, m)
+    can = "cannot be significant at 5%, whatever the data are" if least >= ALPHA else "can be significant at 5%"
+    return [
+        f"The smallest comparison has {n} against {m} runs. An exact permutation test, which takes nothing for granted "
+        f"but that runs are exchangeable, gives no p-value below {least:.3g} there: it {can}.",
+        f"Student's t-test at this size rests on normality and equal variances, which {min(n, m)} values cannot show. "
+        f"It finds a large effect ({LARGE_EFFECT} standard deviations) in {power(LARGE_EFFECT, n, m):.0%} of all "
+        f"cases; to find it in 80% the true effect must be {detectable_effect(n, m):.1f} standard deviations. A result "
+        "that is not significant therefore says little, and one that is overstates the size of the effect.",
+        _least_n(),
+    ]
+
+
+def caveats(threshold: float) -> list[str]:
+    """What a careful reader should know, whatever the numbers are."""
+    survival = (
+        f"The threshold of {threshold:g} is close to mere survival: standing upright for 1,000 steps earns a Humanoid "
+        "5,000 of healthy reward, less the cost of control. Look at episode length and forward velocity beside it."
+    )
+    one_number = (
+        f"The threshold of {threshold:g} is one number: episode length and forward velocity show whether reaching it "
+        "means walking or surviving."
+    )
+    return [
+        survival if 4000 <= threshold <= 5200 else one_number,
+        "The paper calls A2 the best method, slightly ahead of A3, but tests neither against the other. Two "
+        "comparisons with A0 do not order A2 and A3.",
+        "The paper takes p = .54 between H0 and A0 for no difference. A test that finds none is no proof of "
+        "equivalence: the interval of the difference says which differences remain possible.",
+        f"The p-values of {', '.join(FAMILY)} answer one question four times. Holm's adjustment stands beside them; it "
+        "leaves out H0 and H1, which are other questions. A cell that never reached the threshold stays in the family.",
+        "Students of one seed share a teacher, and H1 continues H0; the tests take cells as independent, as the "
+        "paper does.",
+    ]
+
+
+def how_runs_count(consecutive: int) -> list[str]:
+    """How states and censoring are treated."""
+    return [
+        f"Steps to threshold: the step at the end of {consecutive} consecutive episodes whose raw return meets the "
+        "threshold. One number a run; a run, not an episode, is the unit of every test.",
+        "Comparisons take the runs that came to their end. An unfinished run is listed, with its steps to threshold if "
+        "it has reached it, but does not enter means and tests: of unfinished runs the fast ones are known first, and "
+        "a cell would look faster than it is. The Kaplan-Meier curves include it, censored at its last episode.",
+        "A run that diverged will never reach the threshold: it counts as not reached over its whole length (or with "
+        "its steps to threshold, if it diverged later).",
+        "Where some runs of a cell never reached the threshold, its mean is of the others, and no t-test is made, "
+        "because dropping the slowest runs flatters a cell. Restricted means (steps within the horizon) and the "
+        "log-rank test keep every run; both p-values come from permutations.",
+        "Runs without config.yaml and summary.json (foreign) are taken as complete. Damaged and duplicate runs are "
+        "listed and not used.",
+    ]
+
+
+def _least_n() -> str:
+    n = next(n for n in range(2, 20) if len(FAMILY) * smallest_permutation_p(n, n) < ALPHA)
+    least = smallest_permutation_p(n, n)
+    return (
+        f"{n} runs a cell are the least with which the exact test can pass Holm's adjustment over {len(FAMILY)} "
+        f"comparisons (least p-value {least:.4f}, adjusted {len(FAMILY) * least:.3f})."
+    )

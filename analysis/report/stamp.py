@@ -1,0 +1,39 @@
+"""Whether results are still those of the runs they were made from."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+from analysis.loading.load import RunSet
+from analysis.report.html import RUN_FILES
+
+#: File in the results folder that holds the fingerprint of what they were made from.
+STAMP = "inputs.sha256"
+
+
+def fingerprint(data: RunSet, out: Path, settings: dict[str, object]) -> str:
+    """Hash of all that the results follow from: contents of the runs, the analysis itself, its settings.
+
+    Args:
+        data: The runs.
+        out: Folder of the results, for links in them depend on where it lies.
+        settings: Options of the command line.
+    """
+    digest = hashlib.sha256(repr(sorted(settings.items())).encode())
+    digest.update(os.path.relpath(data.root.resolve(), out.resolve()).encode())
+    package = Path(__file__).parent.parent
+    sources = sorted(path for path in package.rglob("*") if path.suffix in (".py", ".html", ".css", ".js", ".csv"))
+    runs = [data.root / str(run) / name for run in data.runs.index for name in (*RUN_FILES, "status.json")]
+    for path, base in [*((path, package) for path in sources), *((path, data.root) for path in runs)]:
+        if path.is_file():
+            content = hashlib.sha256(path.read_bytes()).hexdigest()
+            digest.update(f"{path.relative_to(base).as_posix()} {content}\n".encode())
+    return digest.hexdigest()
+
+
+def is_current(out: Path, value: str) -> bool:
+    """Whether the folder holds results with this fingerprint."""
+    stamp = out / STAMP
+    return (out / "report.html").is_file() and stamp.is_file() and stamp.read_text(encoding="utf-8").strip() == value

@@ -1,0 +1,135 @@
+"""Formats tables: CSV with every digit, Markdown and LaTeX to be read."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from analysis.statistics.comparisons import PAPER_COLUMNS
+
+#: Columns of the table of runs for print; its CSV has more.
+STEPS_COLUMNS = [
+    *("group", "seed", "state", "steps_to_threshold", "steps_to_threshold_first", "episodes"),
+    *("initial_return", "asymptotic_return", "area_under_curve"),
+]
+#: Columns beyond which a LaTeX table spans both columns of a paper.
+WIDE = 6
+#: Letters of a cell beyond which LaTeX breaks its lines.
+SENTENCE = 30
+
+_COUNTS = ("n_", "runs", "censored", "seed", "episodes", "reached")
+_STEPS = ("mean_", "std_", "difference", "restricted_", "steps", "low", "high", "horizon", "last_step", "mean", "std")
+
+
+def write_table(table: pd.DataFrame, out: Path, name: str, caption: str, columns: list[str] | None = None) -> None:
+    """Writes ``name.csv`` (all columns, every digit), ``name.md`` and ``name.tex`` (rounded, booktabs).
+
+    Args:
+        table: The table.
+        out: Folder.
+        name: File name without its ending, also the LaTeX label.
+        caption: LaTeX caption.
+        columns: Those for Markdown and LaTeX; None: all.
+    """
+    table.to_csv(out / f"{name}.csv", index=False, na_rep="NaN", lineterminator="\n")
+    shown = readable(table if columns is None else table[columns])
+    alignment = ["left" if name in _text_columns(table) else "right" for name in shown.columns]
+    shown.columns = pd.Index([heading(str(name)) for name in shown.columns])
+    markdown = shown.to_markdown(index=False, disable_numparse=True, colalign=alignment)
+    (out / f"{name}.md").write_text(markdown + "\n", encoding="utf-8")
+    (out / f"{name}.tex").write_text(_latex(shown, alignment, name, caption), encoding="utf-8")
+
+
+def _latex(shown: pd.DataFrame, alignment: list[str], name: str, caption: str) -> str:
+    """A table as narrow as it can be: headings one word a line, and smaller letters where there are many columns."""
+    sides, wide = [side[0] for side in alignment], len(shown.columns) > WIDE
+    longest = [max(map(len, shown[column]), default=0) for column in shown.columns]
+    widths = ["p{11em}" if length > SENTENCE else side for length, side in zip(longest, sides, strict=True)]
+    cells = shown.style.hide(axis="index").format(_with_minus, escape="latex")
+    escaped = cells.format_index(escape="latex", axis=1).to_latex(
+        hrules=True,
+        caption=caption,
+        environment="table*" if wide else "table",
+        label=f"tab:{name}",
+        position_float="centering",
+        column_format="".join(widths),
+    )
+    before, head, after = re.split(r"(?<=\\toprule\n)(.*)(?= \\\\\n)", escaped, maxsplit=1)
+    stacks = [_stacked(words, side) for words, side in zip(head.split(" & "), sides, strict=True)]
+    small = "\\centering\n\\footnotesize\n\\setlength{\\tabcolsep}{2.5pt}\n"
+    return (before.replace("\\centering\n", small) if wide else before) + " & ".join(stacks) + after
+
+
+def _with_minus(text: object) -> str:
+    return re.sub(r"^-(?=\d)", "$-$", str(text))
+
+
+def _stacked(words: str, side: str) -> str:
+    return rf"\shortstack[{side}]{{{words.replace(' ', chr(92) * 2)}}}" if " " in words else words
+
+
+def readable(table: pd.DataFrame, missing: str = "NaN") -> pd.DataFrame:
+    """The table as text: steps without decimals, the rest with three, NaN as ``missing``."""
+    text = {name: [_cell_text(str(name), value, missing) for value in table[name]] for name in table.columns}
+    return pd.DataFrame(text, columns=table.columns)
+
+
+def paper_columns() -> list[str]:
+    """Columns of table 3 for print: the paper's, the interval of the difference and the exact p-values."""
+    return [*PAPER_COLUMNS, "p_holm", "p_permutation", "p_log_rank"]
+
+
+def _text_columns(table: pd.DataFrame) -> set[str]:
+    return {str(name) for name in table.columns if not pd.api.types.is_numeric_dtype(table[name])}
+
+
+def _cell_text(column: str, value: object, missing: str) -> str:
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if value is None or value is pd.NA:
+        return ""
+    if not isinstance(value, int | float | np.integer | np.floating):
+        return str(value)
+    if pd.isna(value):
+        return missing
+    if isinstance(value, int | np.integer) or column.startswith(_COUNTS) or column.startswith(_STEPS):
+        return f"{value:,.0f}"
+    return f"{value:.3f}"
+
+
+_WORDS = {
+    "std": "SD",
+    "t_score": "T-score",
+    "p_value": "P-value",
+    "p_holm": "P (Holm)",
+    "p_permutation": "P (permutation)",
+    "p_permutation_holm": "P (permutation, Holm)",
+    "p_log_rank": "P (log-rank, permutation)",
+    "p_log_rank_asymptotic": "P (log-rank, asymptotic)",
+    "p_restricted": "P (restricted means, permutation)",
+    "log_rank_z": "log-rank z",
+    "welch_t": "Welch's t",
+    "welch_df": "Welch's df",
+    "welch_p": "Welch's P",
+    "hedges_g": "Hedges' g",
+    "hedges_g_low": "g, 95% from",
+    "hedges_g_high": "g, 95% to",
+    "difference_low": "difference, 95% from",
+    "difference_high": "difference, 95% to",
+    "low": "95% from",
+    "high": "95% to",
+    "power_large_effect": "power for 0.8 SD",
+    "detectable_effect": "effect found in 80% (SD)",
+    "area_under_curve": "mean return (area)",
+}
+
+
+def heading(name: str) -> str:
+    """A column's name as it is read: T-score for t_score."""
+    if name in _WORDS:
+        return _WORDS[name]
+    text = re.sub(r"^std_", "SD ", re.sub(r"^n_", "n ", re.sub(r"^(t|p)_", lambda match: match[0].upper(), name)))
+    return text.replace("_", " ")

@@ -1,0 +1,177 @@
+"""Writes everything into the results folder: tables, scores, figures, report."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from analysis import FORMATS
+from analysis.analyze import Analysis
+from analysis.figures import stills
+from analysis.figures.data import MOST_OTHERS, FigureData, default_window, learning_curves, training_speeds
+from analysis.figures.paper import FIGURES, draw_all, picture, save
+from analysis.figures.style import apply
+from analysis.loading.missing import matrix_command, profile_of
+from analysis.loading.setting_differences import setting_differences
+from analysis.report import prose
+from analysis.report.html import Picture, Report, data_uri, write_report
+from analysis.report.published import side_by_side
+from analysis.report.tables import STEPS_COLUMNS, paper_columns, write_table
+from analysis.statistics.summaries import scores, steps_table, table1, table2, transfer_table
+
+_STILLS = {"figure_2": ("Figure 2", "The source environment"), "figure_3": ("Figure 3", "The target environment")}
+
+
+@dataclass
+class Written:
+    """What was written.
+
+    Attributes:
+        tables: Number of tables (each in three formats).
+        figures: Number of figures (each in two palettes).
+        left_out: A line for what could not be made.
+    """
+
+    tables: int = 0
+    figures: int = 0
+    left_out: list[str] = field(default_factory=list)
+
+
+def write_results(analysis: Analysis, out: Path, options: argparse.Namespace, scratch: Path) -> Written:
+    """Writes all results.
+
+    Args:
+        analysis: The numbers.
+        out: Folder, made if need be.
+        options: ``format``, ``window`` and ``no_stills`` of the command line.
+        scratch: Folder for files that are not kept.
+    """
+    (out / "colorblind").mkdir(parents=True, exist_ok=True)
+    _clear(out)
+    written = Written()
+    # The pictures take seconds, in processes of their own: they are made while the rest is.
+    rendering = [] if options.no_stills else stills.start(analysis.data.pair, scratch)
+    try:
+        report_tables = _write_tables(analysis, out, written)
+        pictures = _write_figures(analysis, out, options, written)
+        pictures = _write_stills(rendering, out, options.format, written) + pictures
+    finally:
+        stills.stop(rendering)
+    defining, differing = setting_differences(analysis.data)
+    write_report(
+        Report(
+            data=analysis.data,
+            profile=profile_of(analysis.data),
+            threshold=analysis.threshold,
+            consecutive=analysis.consecutive,
+            cells=analysis.cells,
+            table3=analysis.table3,
+            groups=analysis.others,
+            measured=analysis.measured,
+            defining=defining,
+            differing=differing,
+            pictures=pictures,
+            missing=analysis.missing,
+            matrix_command=matrix_command(analysis.data),
+            planned_runs=analysis.planned_runs,
+            left_out=written.left_out,
+            about_n=prose.about_n(analysis.table3),
+            caveats=prose.caveats(analysis.threshold),
+            how_runs_count=prose.how_runs_count(analysis.consecutive),
+            **report_tables,
+        ),
+        out,
+    )
+    return written
+
+
+def _clear(out: Path) -> None:
+    """Removes what an earlier analysis may have left and this one need not make again.
+
+    Figures 2 and 3 stay: a machine without a GL library shall not take them away.
+    """
+    names = [f"{spec.name}.{kind}" for spec in FIGURES for kind in FORMATS]
+    for path in [folder / name for folder in (out, out / "colorblind") for name in names]:
+        path.unlink(missing_ok=True)
+    for kind in ("csv", "md", "tex"):
+        (out / f"comparisons.{kind}").unlink(missing_ok=True)
+
+
+def _write_tables(analysis: Analysis, out: Path, written: Written) -> dict[str, pd.DataFrame]:
+    data, measured = analysis.data, analysis.measured
+    tables = {
+        "table1": table1(),
+        "table2": table2(data),
+        "published": side_by_side(analysis.table3),
+        "transfer": transfer_table(measured, data.groups, analysis.reference),
+    }
+    plan = [
+        ("table1", tables["table1"], "Overview of ACMR configurations.", None),
+        ("table2", tables["table2"], "Experiment overview.", None),
+        ("table3", analysis.table3, "Statistical comparison of steps to threshold.", paper_columns()),
+        ("published_table3", tables["published"], "Table 3 beside the published one.", None),
+        ("transfer", tables["transfer"], "Transfer metrics.", None),
+        ("cells", analysis.cells, "Steps to threshold by group.", None),
+        ("steps_to_threshold", steps_table(measured), "Steps to threshold of each run.", STEPS_COLUMNS),
+    ]
+    if len(analysis.others):
+        plan.append(("comparisons", analysis.others, "Groups that are no cells of the paper.", paper_columns()))
+    for name, table, caption, columns in plan:
+        write_table(table, out, name, caption, columns)
+    arrays: dict[str, Any] = scores(measured)
+    np.savez(out / "scores.npz", **arrays)
+    written.tables = len(plan)
+    return tables
+
+
+def _write_figures(analysis: Analysis, out: Path, options: argparse.Namespace, written: Written) -> list[Picture]:
+    apply()
+    measured, data = analysis.measured, analysis.data
+    window = options.window or default_window(measured)
+    drawing = FigureData(
+        runs=measured,
+        episodes=data.episodes,
+        groups=data.groups,
+        comparisons=analysis.comparisons,
+        threshold=analysis.threshold,
+        window=window,
+        planned=analysis.planned,
+        curves=learning_curves(measured, data.episodes, data.groups, window),
+        speeds=training_speeds(data.root, measured, data.groups),
+    )
+    made: dict[str, Picture] = {}
+    for spec, palette, figure in draw_all(drawing):
+        folder = "" if palette.name == "paper" else palette.name
+        svg = save(figure, out / folder, spec.name, options.format)
+        files = [f"{spec.name}.{kind}" for kind in options.format]
+        caption = spec.caption.format(window=window)
+        if spec.limited and len(drawing.others) > MOST_OTHERS:
+            caption += f" Of the {len(drawing.others)} groups that are no cells the first {MOST_OTHERS} are drawn."
+        entry = made.setdefault(spec.name, Picture(spec.name, spec.title, caption, {}, files))
+        entry.images[palette.name] = data_uri(svg, "svg+xml")
+    written.figures += len(made)
+    return list(made.values())
+
+
+def _write_stills(
+    rendering: list[stills.Still], out: Path, formats: tuple[str, ...], written: Written
+) -> list[Picture]:
+    made = []
+    for still in rendering:
+        image, problem = stills.finish(still)
+        title, caption = _STILLS[still.name]
+        if image is None:
+            line = f"figures 2 and 3 left out: {problem}"
+            written.left_out += [line] if line not in written.left_out else []
+            continue
+        save(picture(image), out, still.name, formats)
+        files = [f"{still.name}.{kind}" for kind in formats]
+        address = data_uri(still.path.read_bytes(), "png")
+        made.append(Picture(still.name, title, f"{caption}: {still.env}.", {"paper": address}, files))
+    written.figures += len(made)
+    return made

@@ -1,0 +1,1 @@
+"""From frames of runs to metrics, tests and comparisons."""

@@ -1,0 +1,118 @@
+"""Tables of runs and of groups: the paper's tables 1 and 2, steps to threshold, transfer metrics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from acmr.records import CELLS
+from analysis.loading.load import RunSet
+from analysis.statistics.metrics import jumpstart, transfer_ratio
+from analysis.statistics.survival import restricted_mean
+from analysis.statistics.two_samples import mean_interval
+
+#: The paper's names of the configurations (tables 1 and 2).
+CONFIGURATIONS = {"H0": "Baseline", "H1": "POC", "A0": "Baseline"} | {f"A{n}": f"Conf. {n}" for n in range(1, 5)}
+#: What a cell's transfer is measured against.
+BASELINES = {"H0": None, "H1": "H0", "A0": None}
+
+
+def table1() -> pd.DataFrame:
+    """Overview of the configurations (paper, table 1)."""
+    label = {(transfer, freeze): CONFIGURATIONS[cell] for cell, (_, transfer, freeze) in CELLS.items()}
+    rows = [("Yes" if freeze else "No", label["hidden", freeze], label["expand", freeze]) for freeze in (False, True)]
+    return pd.DataFrame(rows, columns=["Freeze", "Hidden Layer Transfer", "Layer Expansion"])
+
+
+def table2(data: RunSet) -> pd.DataFrame:
+    """Overview of the experiments (paper, table 2), with the settings that they stand for and the runs that count."""
+    names = dict(zip(("source", "target"), data.pair, strict=True))
+    counted = data.runs[data.runs["counted"]].groupby("group").size()
+    rows = [
+        (cell, role.capitalize(), CONFIGURATIONS[cell], names[role], transfer, freeze, int(counted.get(cell, 0)))
+        for cell, (role, transfer, freeze) in CELLS.items()
+    ]
+    columns = ["Experiment", "Environment", "Configuration", "environment_name", "transfer", "freeze", "runs"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def steps_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """One row a run: what it is, its state, its steps to threshold and the other metrics."""
+    columns = [
+        *("group", "cell", "seed", "state", "reason", "steps_to_threshold", "steps_to_threshold_first", "censored"),
+        *("horizon", "episodes", "initial_return", "asymptotic_return", "area_under_curve", "final_length"),
+        *("final_velocity", "wall_seconds", "steps_per_second"),
+    ]
+    return runs.reset_index(names="run")[["run", *columns]]
+
+
+def cell_table(runs: pd.DataFrame, groups: list[str]) -> pd.DataFrame:
+    """One row a group: steps to threshold over its counted runs.
+
+    Args:
+        runs: The runs with their metrics.
+        groups: Groups in the order of the rows.
+
+    Returns:
+        ``group, runs, reached, mean, std, low, high`` (95% t-interval of the mean; mean and the rest only of the runs
+        that reached the threshold, the interval only if all did), ``restricted_mean``, ``hours`` (mean wall-clock).
+    """
+    rows = []
+    for group in groups:
+        own = runs[(runs["group"] == group) & runs["counted"]]
+        values = own["steps_to_threshold"].dropna().to_numpy(dtype=float)
+        low, high = mean_interval(values) if len(values) == len(own) else (np.nan, np.nan)
+        within = (
+            restricted_mean(own["time"], ~own["censored"].astype(bool), own["horizon"].min()) if len(own) else np.nan
+        )
+        rows.append(
+            {
+                "group": group,
+                "runs": len(own),
+                "reached": len(values),
+                "mean": values.mean() if len(values) else np.nan,
+                "std": values.std(ddof=1) if len(values) > 1 else np.nan,
+                "low": low,
+                "high": high,
+                "restricted_mean": within,
+                "hours": own["wall_seconds"].mean() / 3600,
+            }
+        )
+    columns = ["group", "runs", "reached", "mean", "std", "low", "high", "restricted_mean", "hours"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def transfer_table(runs: pd.DataFrame, groups: list[str], reference: str = "A0") -> pd.DataFrame:
+    """The metrics of Taylor and Stone (2009) by group: means over its counted runs, and against its baseline.
+
+    The baseline of H1 is H0, that of the others the reference.
+    """
+    columns = ["initial_return", "asymptotic_return", "area_under_curve"]
+    table = runs[runs["counted"]].groupby("group")[columns].mean()
+    values = zip(table.index, table.to_numpy(dtype=float).tolist(), strict=True)
+    means = {str(group): dict(zip(columns, row, strict=True)) for group, row in values}
+    nothing = dict.fromkeys(columns, float("nan"))
+    rows = []
+    for group in groups:
+        name = BASELINES.get(group, reference if group != reference else None)
+        own, base = means.get(group, nothing), means.get(name or "", nothing)
+        rows.append(
+            {
+                "group": group,
+                "baseline": name or "",
+                **own,
+                "jumpstart": jumpstart(own["initial_return"], base["initial_return"]),
+                "asymptotic_gain": own["asymptotic_return"] - base["asymptotic_return"],
+                "transfer_ratio": transfer_ratio(own["area_under_curve"], base["area_under_curve"]),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def scores(runs: pd.DataFrame) -> dict[str, np.ndarray]:
+    """Asymptotic returns in rliable's shape: for each group an array (runs x tasks), here one task, seeds ascending."""
+    counted = runs[runs["counted"] & runs["asymptotic_return"].notna()]
+    return {
+        str(group): own.sort_values("seed")[["asymptotic_return"]].to_numpy(dtype=float)
+        for group, own in counted.groupby("group", sort=False)
+    }

@@ -1,0 +1,176 @@
+"""What the user sees of a sweep: a live table in a terminal, plain lines elsewhere, and a table at the end."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+
+from sweeps.estimate import Estimate
+from sweeps.folder import COMPLETE, DIVERGED, FAILED, FINAL, RUNNING, STOPPED, SweepFolder, SweepRun
+from sweeps.plan import Plan
+from sweeps.view import BLOCKED, LOST, RunStatus, counts, span, table, view_entries
+
+#: Seconds between two plain lines on how far everything is.
+LINE_INTERVAL = 60.0
+#: Seconds after which the average speed since the start says more than the present one.
+_SETTLED = 30.0
+OUTPUT_FILE = "output.log"
+
+
+class Display:
+    """Follows the runs of a sweep.
+
+    Args:
+        folder: The sweep's folder.
+        entries: Its runs.
+        output_dir: The folder of all runs, as the user typed it.
+    """
+
+    def __init__(self, folder: SweepFolder, entries: Sequence[SweepRun], output_dir: Path) -> None:
+        self._folder, self._entries, self._output_dir = folder, entries, output_dir
+        self.views: list[RunStatus] = []
+        self._told: dict[int, tuple[str, str]] = {}
+        self._started = time.monotonic()
+        self._said_at = self._looked_at = self._started
+        # Looking at many runs takes time from the trainings.
+        self._interval = 1.0 if len(entries) <= 100 else 5.0
+        self._console = Console(highlight=False)
+        terminal = sys.stdout.isatty() and os.environ.get("TERM") not in (None, "", "dumb")
+        self.refresh()
+        self._first_steps = self._steps()
+        self._live = Live(self._drawing(), console=self._console, auto_refresh=False) if terminal else None
+        if self._live is not None:
+            self._live.start(refresh=True)
+            # Left hidden, it would stay so after a kill.
+            self._console.show_cursor(True)
+
+    def refresh(self) -> None:
+        """Looks at all runs that have not ended."""
+        self._looked_at = time.monotonic()
+        known = {index: view for index, view in enumerate(self.views) if view.state in (COMPLETE, DIVERGED)}
+        if len(known) < len(self._entries):
+            states = [self._folder.state(entry.index) for entry in self._entries]
+            self.views = view_entries(self._output_dir, self._entries, states, known)
+
+    def tick(self) -> None:
+        """Looks, if that is due, and shows what is new."""
+        if time.monotonic() - self._looked_at < self._interval:
+            return
+        self.refresh()
+        if self._live is not None:
+            self._live.update(self._drawing(), refresh=True)
+            return
+        for index, view in enumerate(self.views):
+            if self._told.get(index) != (view.state, view.reason):
+                self._tell(index, view)
+        if time.monotonic() - self._said_at >= LINE_INTERVAL:
+            self._said_at = time.monotonic()
+            self.say(self.line())
+
+    def say(self, text: str) -> None:
+        """Prints a line, above the table if there is one."""
+        self._console.print(text, markup=False, soft_wrap=True)
+        sys.stdout.flush()
+
+    def close(self) -> None:
+        """Shows all a last time."""
+        self._interval = 0.0
+        self.tick()
+        if self._live is not None:
+            self._live.stop()
+
+    def line(self) -> str:
+        """How far the whole is."""
+        speed = self._speed()
+        ahead = sum(view.total - view.step for view in self.views if view.state not in (*FINAL, BLOCKED))
+        eta = f"; {speed:,.0f} steps/s, {span(ahead / speed)} left" if speed and ahead else ""
+        return f"{counts(self.views)}{eta}"
+
+    def closing_table(self) -> int:
+        """Prints what went wrong and why.
+
+        Returns:
+            How many runs failed or cannot start.
+        """
+        rows = [("state", "run", "seed", "log", "why")]
+        for view in self.views:
+            if view.state in (FAILED, BLOCKED, DIVERGED, LOST):
+                log = view.directory / OUTPUT_FILE
+                rows.append((view.state, view.name, str(view.seed), str(log) if log.exists() else "-", view.reason))
+        if len(rows) > 1:
+            widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
+            for row in rows:
+                self.say(
+                    "  ".join([*(cell.ljust(width) for cell, width in zip(row[:-1], widths, strict=True)), row[-1]])
+                )
+        return sum(view.state in (FAILED, BLOCKED) for view in self.views)
+
+    def _tell(self, index: int, view: RunStatus) -> None:
+        before, self._told[index] = self._told.get(index), (view.state, view.reason)
+        if before is None and view.state != RUNNING:
+            return
+        if view.state in (RUNNING, *FINAL, STOPPED, BLOCKED):
+            detail = f": {view.reason}" if view.reason else ""
+            if view.state == COMPLETE and view.latest is not None:
+                detail = f": return {view.latest:,.0f}, {view.speed:,.0f} steps/s"
+            self.say(f"{view.state}  {view.name} seed {view.seed}{detail}")
+
+    def _steps(self) -> int:
+        return sum(view.total if view.state in FINAL else view.step for view in self.views)
+
+    def _speed(self) -> float:
+        now = sum(view.speed for view in self.views if view.state == RUNNING)
+        elapsed = time.monotonic() - self._started
+        return (self._steps() - self._first_steps) / elapsed if elapsed > _SETTLED else now
+
+    def _drawing(self) -> Group:
+        height = max(self._console.size.height - 4, 5)
+        shown = self.views
+        if len(shown) > height:
+            # What runs or went wrong first; the rest is in the line below.
+            quiet = (COMPLETE, "waiting")
+            shown = sorted(self.views, key=lambda view: (view.state in quiet, view.state))[:height]
+        text = Text(self.line(), style="bold", no_wrap=True, overflow="ellipsis")
+        lines = [Text(line, style=color or "", no_wrap=True, overflow="ellipsis") for line, color in table(shown)]
+        return Group(*lines, text)
+
+
+def print_plan(plan: Plan, needs: Estimate, workers: int, output_dir: Path) -> None:
+    """Prints what would be done."""
+    console = Console(width=None if sys.stdout.isatty() else 200, highlight=False)
+    stage_of = {run.index: number for number, stage in enumerate(plan.stages, start=1) for run in stage}
+    for run in plan.runs:
+        cell = f"{run.spec.cell}  " if run.spec.cell else ""
+        state = run.ended or f"stage {stage_of[run.index]}"
+        added = "  (added: the teacher of runs below)" if run.implied else ""
+        console.print(f"{state:<10} {cell}{run.spec.directory}{added}", markup=False, soft_wrap=True)
+    stages = ", then ".join(str(len(stage)) for stage in plan.stages)
+    done = len(plan.runs) - len(plan.missing)
+    console.print(
+        f"{_number(len(plan.runs))}: {done} done, {len(plan.missing)} missing{f' ({stages})' if stages else ''}"
+    )
+    if not plan.missing:
+        return
+    source = f"as fast as {_number(needs.measured_on)} that ended in {output_dir}"
+    time_needed = f"about {span(needs.seconds)}, {source}" if needs.seconds else "not known until a run is complete"
+    console.print(f"workers: {workers}")
+    console.print(f"time: {time_needed}", soft_wrap=True)
+    console.print(f"memory: {_bytes(needs.memory)} at most, once the replay memories are full", soft_wrap=True)
+    console.print(f"disk: {_bytes(needs.disk)} at most; {_bytes(needs.kept)} stay", soft_wrap=True)
+
+
+def _number(count: int) -> str:
+    return f"{count} run{'' if count == 1 else 's'}"
+
+
+def _bytes(size: float | None) -> str:
+    if size is None:
+        return "an amount not known"
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"
