@@ -20,6 +20,11 @@ NEUTRAL_KEYS = (
 #: Settings that a teacher must share with its student: its length and the shape of its networks.
 TEACHER_KEYS = ("total_timesteps", "agent.hidden_sizes")
 
+#: When a run ends: after all its steps, or as soon as it has met its threshold.
+HORIZON, THRESHOLD = "horizon", "threshold"
+#: Settings that can only cut a run short: what it does until then stays the same, and so does the paper's cell.
+STOP_KEYS = ("stop", "stop_after")
+
 TRACKING_MODES = ("off", "offline", "self_hosted")
 PROGRESS_MODES = ("auto", "bar", "lines", "off")
 #: How matrix products are computed.
@@ -115,6 +120,11 @@ class ExperimentConfig:
     total_timesteps: int = 1_000_000
     threshold: float = 4900.0
     consecutive: int = 5
+    #: ``horizon``: all steps are taken; ``threshold``: the run ends with the episode that completes the streak of
+    #: ``consecutive`` ones at the threshold. Until there it is bit for bit the run that takes all steps.
+    stop: str = HORIZON
+    #: Steps after which a run with ``stop=threshold`` ends even if it has not met it; None: ``total_timesteps``.
+    stop_after: int | None = None
     device: str = "cpu"
     threads: int = 1
     output_dir: str = "runs"
@@ -132,6 +142,11 @@ class ExperimentConfig:
     agent: SACConfig = field(default_factory=SACConfig)
     transfer: TransferConfig = field(default_factory=TransferConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    @property
+    def most_steps(self) -> int:
+        """Environment steps after which the run ends at the latest."""
+        return self.total_timesteps if self.stop_after is None else self.stop_after
 
 
 def validate(config: ExperimentConfig) -> None:
@@ -171,8 +186,28 @@ def validate(config: ExperimentConfig) -> None:
     _one_of("tracking.mode", config.tracking.mode, TRACKING_MODES)
     _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
     _check_transfer(config)
+    _check_stop(config)
     if config.tracking.mode == "self_hosted" and not config.tracking.base_url:
         raise ConfigError("tracking=self_hosted needs the server's address: tracking.base_url=http://HOST:PORT")
+
+
+def _check_stop(config: ExperimentConfig) -> None:
+    _one_of("stop", config.stop, (HORIZON, THRESHOLD))
+    after = config.stop_after
+    if after is None:
+        return
+    _at_least("stop_after", after, 1)
+    if config.stop != THRESHOLD:
+        raise ConfigError(
+            f"stop_after={after} stop={config.stop}: only a run that stops at its threshold may end before its last "
+            f"step; type stop=threshold stop_after={after}, or total_timesteps={after} for a shorter run"
+        )
+    # It would change nothing, and give one run two names.
+    if after >= config.total_timesteps:
+        raise ConfigError(
+            f"stop_after={after}: the run has ended by then (total_timesteps={config.total_timesteps}); "
+            "type less, or leave stop_after out"
+        )
 
 
 def _check_transfer(config: ExperimentConfig) -> None:
@@ -233,14 +268,24 @@ def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def schema_defaults() -> dict[str, Any]:
+    """The value of every setting, as ``group.key``, where no file and no command line says anything."""
+    return flatten(asdict(ExperimentConfig()))
+
+
 def is_neutral(key: str) -> bool:
     """Whether a setting cannot change what a run computes."""
     return key.split(".")[0] in NEUTRAL_KEYS
 
 
 def differing_keys(stored: Mapping[str, Any], config: ExperimentConfig) -> list[str]:
-    """Settings, of those that change the result, in which a stored run differs from this one."""
-    before, now = flatten(stored), flatten(asdict(config))
+    """Settings, of those that change the result, in which a stored run differs from this one.
+
+    A setting that the stored run knew nothing of has the schema's default: one that is added to the schema must default
+    to what was done before, and then orphans no run. One that only the stored run knows did something that cannot be
+    done any more, so it counts as a difference, unless it was null: not set.
+    """
+    before, now = schema_defaults() | flatten(stored), flatten(asdict(config))
     keys = sorted(set(before) | set(now))
     return [
         key

@@ -98,6 +98,15 @@ class StepsToThreshold:
     first: int
 
 
+def meets_threshold(returns: Sequence[float], threshold: float, consecutive: int = 5) -> bool:
+    """Whether the latest ``consecutive`` of these returns are all at least ``threshold``.
+
+    Asked after each episode, it is first true at the episode that :func:`steps_to_threshold` finds.
+    """
+    latest = returns[-consecutive:]
+    return len(latest) == consecutive and all(value >= threshold for value in latest)
+
+
 def steps_to_threshold(
     global_steps: Sequence[int], returns: Sequence[float], threshold: float, consecutive: int = 5
 ) -> StepsToThreshold | None:

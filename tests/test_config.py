@@ -3,13 +3,17 @@
 import itertools
 import math
 import re
+from copy import deepcopy
+from dataclasses import asdict
+from functools import reduce
+from operator import getitem
 
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acmr.config import ExperimentConfig, SACConfig
+from acmr.config import NEUTRAL_KEYS, ExperimentConfig, SACConfig, differing_keys, flatten, schema_defaults
 from acmr.records import CELLS
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.errors import USER_ERRORS, check_booleans, explain
@@ -110,6 +114,11 @@ def test_python_defaults_say_what_the_paper_profile_says():
         (["tracking=self_hosted"], "tracking.base_url=http://HOST:PORT"),
         (["env=gym"], "env.id has no value: type env.id=VALUE"),
         (["seed=="], "not of the form key=value"),
+        (["stop=never"], "stop=never: must be one of horizon, threshold"),
+        (["stop=treshold"], "must be one of horizon, threshold"),
+        (["stop=threshold", "stop_after=0"], "stop_after=0: an integer of at least 1"),
+        (["stop_after=9"], "type stop=threshold stop_after=9, or total_timesteps=9 for a shorter run"),
+        (["stop=threshold", "stop_after=1000000"], "the run has ended by then (total_timesteps=1000000)"),
         (["env.source=nowhere", "transfer=expand", "output_dir=x"], None),
     ],
 )
@@ -134,6 +143,9 @@ def test_what_cannot_be_run_is_refused_in_one_line(overrides, says):
         (["agent.hidden_sizes=[64,64]"], "runs/paper/armless_humanoid-none-hidden_sizes=64+64/seed_1"),
         (["device=cuda", "threads=2", "tracking=off", "progress=off", "log_every=7"],
          "runs/paper/armless_humanoid-none/seed_1"),
+        (["experiment=A2", "stop=threshold"], "runs/paper/armless_humanoid-hidden-frozen-stop=threshold/seed_1"),
+        (["stop=horizon", "stop_after=null"], "runs/paper/armless_humanoid-none/seed_1"),
+        (["stop=threshold", "stop_after=9"], "runs/paper/armless_humanoid-none-stop=threshold-stop_after=9/seed_1"),
         (["env=gym", "env.id=Hopper-v5", "output_dir=elsewhere"], "elsewhere/paper/Hopper-v5-none/seed_1"),
         (["env=gym", "env.id=Hopper-v5", "env.drop_sensors=[0,3]"],
          "runs/paper/Hopper-v5-none-drop_sensors=0+3/seed_1"),
@@ -157,6 +169,15 @@ def test_a_cell_with_other_settings_is_not_the_papers():
     assert spec("env=humanoid", "transfer=hidden").cell is None
 
 
+def test_the_beginning_of_a_cell_is_that_cell(tmp_path):
+    for cell in CELLS:
+        assert spec(f"experiment={cell}", "stop=threshold").cell == cell
+        assert spec(f"experiment={cell}", "stop=threshold", "stop_after=9").cell == cell
+    assert spec("experiment=A2", "stop=threshold", "agent.q_lr=1e-4").cell is None
+    assert spec("experiment=A2", "stop=threshold", "threshold=1").cell is None
+    assert spec("experiment=A2", "stop=threshold", f"transfer.teacher={tmp_path}").cell is None
+
+
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10**12), st.sampled_from(["none", "hidden", "expand"]), st.booleans(), st.integers(1, 10**7))
 def test_the_command_of_a_run_leads_back_to_it(seed, transfer, freeze, steps):
@@ -173,6 +194,7 @@ def test_the_command_of_a_run_leads_back_to_it(seed, transfer, freeze, steps):
         (["experiment=A2", "profile=quick"], "python run.py profile=quick env=ant seed=1"),
         (["experiment=A1", "total_timesteps=20000"], "python run.py env=humanoid total_timesteps=20000 seed=1"),
         (["experiment=A1", "agent.q_lr=1e-4"], "python run.py env=humanoid seed=1"),
+        (["experiment=A1", "stop=threshold", "stop_after=9"], "python run.py env=humanoid seed=1"),
         (["env=gym", "env.id=Hopper-v5", "env.drop_sensors=[0]", "transfer=expand"],
          "python run.py env=gym env.id=Hopper-v5 seed=1"),
     ],
@@ -182,3 +204,34 @@ def test_a_students_teacher_is_the_source_run_of_its_seed(overrides, command):
     assert teacher.command == command
     assert teacher.config.transfer.name == "none"
     assert spec(*command.split()[2:]).directory == teacher.directory
+
+
+def without(stored: dict, key: str) -> dict:
+    *groups, leaf = key.split(".")
+    copy = deepcopy(stored)
+    del reduce(getitem, groups, copy)[leaf]
+    return copy
+
+
+@pytest.mark.parametrize("overrides", [["experiment=A3"], ["experiment=H0", "profile=quick"]])
+def test_a_setting_that_a_stored_run_lacks_had_its_default(overrides):
+    config, defaults = spec(*overrides).config, schema_defaults()
+    stored = asdict(config)
+    assert differing_keys(stored, config) == []
+    for key, value in flatten(stored).items():
+        neutral = key.split(".")[0] in NEUTRAL_KEYS or key == "transfer.teacher"
+        same = neutral or (key in defaults and value == defaults[key])
+        assert differing_keys(without(stored, key), config) == ([] if same else [key])
+    for group in ("agent", "transfer"):
+        assert set(differing_keys({key: stored[key] for key in stored if key != group}, config)) <= {
+            key for key in flatten(stored) if key.startswith(group)
+        }
+
+
+def test_a_setting_that_only_a_stored_run_knows_is_a_difference_if_it_was_set():
+    config = spec().config
+    stored = asdict(config)
+    assert differing_keys({**stored, "noise": 0.1}, config) == ["noise"]
+    assert differing_keys({**stored, "agent": {**stored["agent"], "layer_norm": False}}, config) == ["agent.layer_norm"]
+    assert differing_keys({**stored, "noise": None}, config) == []
+    assert differing_keys({}, config) != []

@@ -172,6 +172,26 @@ def test_the_bar_gives_way_to_what_matters_more() -> None:
     assert "seed 3" in progress.line(150)
 
 
+def test_a_run_that_may_stop_before_its_last_step_says_so() -> None:
+    clock, lines = Clock(), list[str]()
+    progress = LineProgress(1000, 900.0, 1, say=lines.append, clock=clock, stops=True)
+    for step in range(1, 101):
+        clock.now += 1.0
+        progress.update(step)
+    assert lines[0] == "step 0 of 1,000, threshold 900, where it stops"
+    assert ", at most 15:40 left, no episode yet" in lines[1]
+
+
+@pytest.mark.parametrize(("stops", "says"), [(True, "took 0 s"), (False, "ETA")])
+def test_the_bar_of_a_run_that_stopped_is_at_its_end(stops: bool, says: str) -> None:
+    progress = BarProgress(1000, 900.0, 1, stops=stops)
+    assert "ETA" in progress.line(120)
+    progress.update(10)
+    progress.episode(episode(10, 950.0))
+    progress.close()
+    assert says in progress.line(120)
+
+
 def test_a_step_costs_next_to_nothing() -> None:
     progress = RunProgress(1_000_000, 900.0, 5)
     before = time.thread_time()

@@ -17,6 +17,7 @@ from acmr.config import ConfigError, TrackingConfig
 from acmr.records import EpisodeRecord
 from acmr.tracking.mirror import main, rebuild
 from acmr.tracking.wandb_backend import linked_mirrors, run_id
+from acmr.tracking.wandb_tracker import _label, labels
 
 EPISODE = EpisodeRecord(120, 71.25, 120, 0.5, {"reward_forward": 3.5, "reward_ctrl": -1.0})
 EPISODE_ROW = {
@@ -166,3 +167,12 @@ def test_run_ids_are_readable_stable_and_distinct(tmp_path: Path) -> None:
     assert all(len(name) <= 128 and not set(name) & set("/\\#?%:[]()") for name in ids)
     shared = {run_id(other, tmp_path / folder, "quick", "ant-none", 1) for folder in ("runs", "more")}
     assert len(shared) == 2
+
+
+def test_a_run_that_stops_at_its_threshold_is_of_its_cell_but_not_averaged_with_full_ones() -> None:
+    full, stopped = SETTINGS, {**SETTINGS, "stop": "threshold"}
+    name = f"{RUN}-stop=threshold"
+    assert labels(full, RUN, "A2")["group"] == "quick/A2"
+    assert labels(stopped, name, "A2")["group"] == f"quick/{name}"
+    assert labels(stopped, name, "A2")["tags"] == [*labels(full, RUN, "A2")["tags"], "stopped"]
+    assert _label("quick", name, 3, labels(stopped, name, "A2")["tags"]) == "A2-s3-quick-stopped"

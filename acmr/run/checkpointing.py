@@ -191,7 +191,7 @@ class CheckpointSchedule:
             Stopped: If the run was asked to stop, with a checkpoint where that is possible.
             WriteError: If the disk does not take it; the one before is good still.
         """
-        if (global_step < self._due_at and self._stop.received is None) or global_step == self._trainer.total_timesteps:
+        if (global_step < self._due_at and self._stop.received is None) or self._trainer.is_over:
             return
         possible = self._makes_any and (self._anytime or self._trainer.observation is None)
         if self._stop.received is not None:

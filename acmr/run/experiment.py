@@ -14,7 +14,7 @@ from acmr.agent.precision import MatmulPrecision, choose_products
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.agent.replay_files import BufferFiles
 from acmr.agent.sac import SAC
-from acmr.config import flatten, is_neutral
+from acmr.config import THRESHOLD, flatten, is_neutral, schema_defaults
 from acmr.envs import make_env
 from acmr.envs.physics import PhysicsWarnings, no_log_file
 from acmr.envs.state import ANYTIME, NEVER, ResumeCheck, rehearse
@@ -124,7 +124,7 @@ class Session:
         """Makes the parts of the run as they are before its first step; touches no disk."""
         prepared, config, folder = self.prepared, self.prepared.spec.config, self.run_dir.checkpoint_folder
         dims, streams, about = prepared.networks.dims, prepared.streams, prepared.about
-        env = PhysicsWarnings(make_env(config.env))
+        env, logs = PhysicsWarnings(make_env(config.env)), RunLogs(self.run_dir, about)
         trainer = Trainer(
             env=env,
             agent=SAC(
@@ -132,11 +132,12 @@ class Session:
             ),
             buffer=ReplayBuffer(config.agent.buffer_size, dims.observation, dims.action, config.device),
             streams=streams,
-            total_timesteps=config.total_timesteps,
+            total_timesteps=config.most_steps,
             log_every=config.log_every,
             episode=EpisodeInProgress(about.reward_terms, about.has_forward_velocity),
+            is_satisfied=lambda: config.stop == THRESHOLD and logs.meet(config.threshold, config.consecutive),
         )
-        state = RunState(trainer, env.counts, RunLogs(self.run_dir, about), BufferFiles(folder, trainer.buffer))
+        state = RunState(trainer, env.counts, logs, BufferFiles(folder, trainer.buffer))
         store = SnapshotStore(folder, arrays_bytes(prepared.networks))
         return state, Checkpoints(store, state, self._conditions())
 
@@ -161,7 +162,7 @@ class Session:
 
     def _train(self, checkpoints: Checkpoints, state: RunState) -> dict[str, Any]:
         spec, trainer, run_dir = self.prepared.spec, state.trainer, self.run_dir
-        heartbeat = Heartbeat(run_dir.path, spec.config.total_timesteps, trainer.global_step)
+        heartbeat = Heartbeat(run_dir.path, trainer.total_timesteps, trainer.global_step)
         tracker = _tracker(spec, self.say)
         replay(tracker, run_dir.path)
         recorder = Recorder(state.logs, tracker, _progress(spec, trainer.global_step), heartbeat)
@@ -195,7 +196,7 @@ class Session:
         else:
             self._remove(checkpoints)
             speed = f"{summary['steps_per_second']:.0f} steps per second"
-            self.say(f"{run_dir}: complete{reached(summary)}, {speed}")
+            self.say(f"{run_dir}: complete, {speed}{reached(summary)}")
         return summary
 
     def _remove(self, checkpoints: Checkpoints) -> None:
@@ -212,14 +213,16 @@ class Session:
             "physics_warnings": dict(state.warnings),
             "inexact_resumes": checkpoints.inexact,
         }
-        return summarize(self.prepared.spec, state.logs.history, state.seconds, diverged) | more
+        steps, history = state.trainer.global_step, state.logs.history
+        return summarize(self.prepared.spec, history, steps, state.seconds, diverged) | more
 
     def _conditions(self) -> CheckpointKey:
-        spec, report = self.prepared.spec, asdict(self.prepared.report)
+        spec, report, usual = self.prepared.spec, asdict(self.prepared.report), schema_defaults()
+        # Only what differs from the schema's defaults: a setting that is added to it voids no checkpoint then.
         settings = {
             key: value
             for key, value in flatten(spec.settings).items()
-            if not is_neutral(key) and key != "transfer.teacher"
+            if not is_neutral(key) and key != "transfer.teacher" and (key not in usual or value != usual[key])
         }
         # One teacher may be reached by several paths; its hash says which it is.
         teacher = {**(report["teacher"] or {}), "path": None}
@@ -258,9 +261,10 @@ def _progress(spec: RunSpec, start_step: int) -> RunProgress:
     config = spec.config
     return make_progress(
         config.progress,
-        total_timesteps=config.total_timesteps,
+        total_timesteps=config.most_steps,
         threshold=config.threshold,
         consecutive=config.consecutive,
+        stops=config.stop == THRESHOLD,
         title=" ".join([*([spec.cell] if spec.cell else []), spec.name, f"seed {config.seed}"]),
         start_step=start_step,
     )

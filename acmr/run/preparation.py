@@ -117,7 +117,7 @@ def space_needed(config: ExperimentConfig, networks: Networks) -> int:
     if config.checkpoint_every == 0:
         return weights + _SMALL
     dims, agent = networks.dims, config.agent
-    replay = replay_bytes(agent.buffer_size, config.total_timesteps, dims.observation, dims.action)
+    replay = replay_bytes(agent.buffer_size, config.most_steps, dims.observation, dims.action)
     # One checkpoint more while the oldest is still there; each holds weights, most of their targets, two moments.
     return replay + (KEPT + 1) * 4 * weights + _SMALL
 

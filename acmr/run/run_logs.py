@@ -8,7 +8,7 @@ from pathlib import Path
 
 from acmr.agent.sac import METRIC_NAMES
 from acmr.envs import EnvDescription
-from acmr.records import EPISODE_COLUMNS, VELOCITY_COLUMN, EpisodeRecord
+from acmr.records import EPISODE_COLUMNS, VELOCITY_COLUMN, EpisodeRecord, meets_threshold
 from acmr.storage.csv_log import CsvLog
 from acmr.storage.durable import DamagedError, FileDigest
 from acmr.storage.run_dir import RunDir
@@ -62,6 +62,11 @@ class RunLogs:
     def metrics(self, global_step: int, values: Mapping[str, float]) -> None:
         """Records means over the last steps."""
         self._logs["metrics"].row([global_step, *(values[name] for name in _METRIC_COLUMNS[1:])])
+
+    def meet(self, threshold: float, consecutive: int) -> bool:
+        """Whether the latest ``consecutive`` episodes have all returned at least ``threshold``."""
+        latest = [record.episodic_return for record in self.history[-consecutive:]]
+        return meets_threshold(latest, threshold, consecutive)
 
     def marks(self) -> dict[str, FileDigest]:
         """Waits until every row is on the disk, and says what each file holds."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from acmr.agent.sac import SAC
+from acmr.config import THRESHOLD
 from acmr.envs import EnvDescription
 from acmr.records import COMPLETE, DIVERGED, EpisodeRecord, steps_to_threshold
 from acmr.run.reproducibility import git_commit, machine, versions
@@ -21,18 +22,18 @@ FINAL_EPISODES = 10
 
 
 def summarize(
-    spec: RunSpec, history: Sequence[EpisodeRecord], wall: float, diverged: DivergedError | None = None
+    spec: RunSpec, history: Sequence[EpisodeRecord], steps: int, wall: float, diverged: DivergedError | None = None
 ) -> dict[str, Any]:
     """The content of ``summary.json``.
 
     Args:
         spec: The run.
         history: Every episode that ended.
+        steps: Environment steps that were taken.
         wall: Seconds that the training took.
         diverged: What ended it, if it did not come to its last step.
     """
     config = spec.config
-    steps = diverged.step if diverged else config.total_timesteps
     returns = [record.episodic_return for record in history]
     met = steps_to_threshold([record.global_step for record in history], returns, config.threshold, config.consecutive)
     return {
@@ -47,6 +48,8 @@ def summarize(
         "seed": config.seed,
         "global_step": steps,
         "total_timesteps": config.total_timesteps,
+        "stop": config.stop,
+        "stop_after": config.stop_after,
         "episodes": len(history),
         "threshold": config.threshold,
         "consecutive": config.consecutive,
@@ -89,7 +92,7 @@ def describe_teacher(
         log_alpha=agent.log_alpha.item(),
         seed=spec.config.seed,
         profile=spec.config.profile,
-        global_step=spec.config.total_timesteps,
+        global_step=summary["global_step"],
         final_return=summary["final_return"],
         config=json.loads(json.dumps(spec.settings)),
     )
@@ -97,6 +100,9 @@ def describe_teacher(
 
 def reached(summary: Mapping[str, Any]) -> str:
     """Whether a run met its threshold, in words that follow on others."""
-    step = summary.get("steps_to_threshold")
+    step, total = summary.get("steps_to_threshold"), summary.get("total_timesteps")
     threshold = f"{summary.get('threshold', float('nan')):g}"
-    return f", return {threshold} reached at step {step:,}" if step else f", return {threshold} not reached"
+    said = f", return {threshold} reached at step {step:,}" if step else f", return {threshold} not reached"
+    if summary.get("stop") != THRESHOLD or summary["global_step"] == total:
+        return said
+    return f"{said}; stopped there" if step else f"{said} by step {summary['global_step']:,}; stopped there"

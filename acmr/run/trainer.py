@@ -34,6 +34,10 @@ def _ignore(*_: object) -> None:
     """Does nothing with what it is told."""
 
 
+def _never() -> bool:
+    return False
+
+
 @dataclass
 class Trainer:
     """Trains one agent in one environment.
@@ -43,9 +47,10 @@ class Trainer:
         agent: The learner.
         buffer: Replay memory.
         streams: Random numbers of the run.
-        total_timesteps: Environment steps to take.
+        total_timesteps: Environment steps to take at most.
         log_every: Environment steps between two rows of metrics.
         episode: Sums over the current episode.
+        is_satisfied: Asked between two episodes whether the training may end before its last step.
         on_step: Called when all of a step is done, with its number; what it raises ends the training.
         on_episode: Called as each episode ends.
         on_metrics: Called with the step, and means since the last call, ``steps_per_second`` among them.
@@ -60,11 +65,18 @@ class Trainer:
     total_timesteps: int
     log_every: int
     episode: EpisodeInProgress
+    is_satisfied: Callable[[], bool] = _never
     on_step: Callable[[int], None] = _ignore
     on_episode: Callable[[EpisodeRecord], None] = _ignore
     on_metrics: Callable[[int, dict[str, float]], None] = _ignore
     global_step: int = 0
     observation: np.ndarray | None = None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no further step is to be taken."""
+        # Asked anew rather than kept: a run that was killed right here must not go on when it is taken up again.
+        return self.global_step >= self.total_timesteps or (self.observation is None and self.is_satisfied())
 
     def train(self) -> None:
         """Runs from the step that was reached to the last.
@@ -73,7 +85,7 @@ class Trainer:
             DivergedError: If a number that must be finite is not.
         """
         since = (time.perf_counter(), self.global_step)
-        while self.global_step < self.total_timesteps:
+        while not self.is_over:
             self._step()
             if self.global_step % self.log_every == 0:
                 now, (before, first) = time.perf_counter(), since

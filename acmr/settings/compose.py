@@ -20,7 +20,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue
 
-from acmr.config import ConfigError, EnvConfig, ExperimentConfig, flatten, validate
+from acmr.config import ConfigError, EnvConfig, ExperimentConfig, flatten, schema_defaults, validate
 
 CONFIG_FOLDER = Path(__file__).resolve().parents[2] / "conf"
 
@@ -88,7 +88,7 @@ def _refuse_unknown(node: DictConfig, prefix: str = "") -> None:
 
 def setting_keys() -> list[str]:
     """Every setting there is, as ``group.key``."""
-    return sorted(flatten(asdict(ExperimentConfig())))
+    return sorted(schema_defaults())
 
 
 def unknown_key(key: str) -> str:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.config import TEACHER_KEYS, ConfigError, ExperimentConfig, flatten, is_neutral
+from acmr.config import HORIZON, STOP_KEYS, TEACHER_KEYS, ConfigError, ExperimentConfig, flatten, is_neutral
 from acmr.records import CELLS, DESCRIPTION_FILE
 from acmr.settings.compose import as_override, baseline, compose_config, env_overrides, parse
 
@@ -27,7 +27,7 @@ class RunSpec:
         config: All settings.
         changes: Those that change the result and differ from the profile's own.
         name: Directory name, ``<env>-<transfer>[-frozen][-<key>=<value>...]``.
-        cell: The paper's name of the experiment, if the run is one of its experiments.
+        cell: The paper's name of the experiment, if the run is one of its experiments, or the beginning of one.
     """
 
     config: ExperimentConfig
@@ -64,7 +64,7 @@ def specify(config: ExperimentConfig) -> RunSpec:
     name = "-".join([*parts, *suffix])
     if len(name) > _MAX_NAME:
         name = "-".join([*parts, _digest(suffix)])
-    cell = None if shown else cell_of(config)
+    cell = cell_of(config) if set(shown) <= set(STOP_KEYS) else None
     return RunSpec(config, changes, name, cell)
 
 
@@ -76,11 +76,15 @@ def cell_of(config: ExperimentConfig) -> str | None:
 
 
 def teacher_spec(config: ExperimentConfig) -> RunSpec:
-    """The run that teaches a student: its source environment, profile, seed, length and network sizes."""
+    """The run that teaches a student: its source environment, profile, seed, length and network sizes.
+
+    It takes all its steps even where its student stops, or its profile lets runs stop, at the threshold: what a student
+    learns from must not depend on when its teacher happened to be good.
+    """
     overrides = [*env_overrides(config.env.source), f"profile={config.profile}", f"seed={config.seed}"]
     flat = flatten(asdict(config))
     overrides += [f"{key}={as_override(flat[key])}" for key in TEACHER_KEYS]
-    overrides.append(f"output_dir={as_override(config.output_dir)}")
+    overrides += [f"stop={HORIZON}", "stop_after=null", f"output_dir={as_override(config.output_dir)}"]
     try:
         return specify(parse(compose_config(overrides)))
     except ConfigError as error:

@@ -41,11 +41,13 @@ class RunProgress:
         consecutive: int,
         start_step: int = 0,
         clock: Callable[[], float] = time.monotonic,
+        stops: bool = False,
     ) -> None:
         """Starts the clock; see :func:`make_progress`."""
         self._total = total_timesteps
         self._threshold = threshold
         self._consecutive = consecutive
+        self._stops = stops
         self._clock = clock
         self._step = start_step
         self._next_look = start_step + 1
@@ -82,6 +84,16 @@ class RunProgress:
         """Time to the end at the present speed; None while that is unknown."""
         speed = self.steps_per_second
         return (self._total - self._step) / speed if speed > 0 else None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the last step has been taken."""
+        return self._step >= self._total or (self._stops and self._reached is not None)
+
+    def time_left(self) -> str:
+        """The time to the end in words; a run that stops at its threshold may need less."""
+        left = self.seconds_left
+        return "-" if left is None else f"{'at most ' if self._stops else ''}{duration(left)}"
 
     def standing(self) -> str:
         """The latest return and how far it is from the threshold."""
@@ -128,12 +140,14 @@ class LineProgress(RunProgress):
         start_step: int = 0,
         say: Callable[[str], None] = lambda line: print(line, flush=True),
         clock: Callable[[], float] = time.monotonic,
+        stops: bool = False,
     ) -> None:
         """Says where the run starts."""
-        super().__init__(total_timesteps, threshold, consecutive, start_step, clock)
+        super().__init__(total_timesteps, threshold, consecutive, start_step, clock, stops)
         self._say = say
         self._prefix = f"{title}: " if title else ""
-        self._say(f"{self._prefix}step {start_step:,} of {total_timesteps:,}, threshold {threshold:,g}")
+        ends = ", where it stops" if stops else ""
+        self._say(f"{self._prefix}step {start_step:,} of {total_timesteps:,}, threshold {threshold:,g}{ends}")
 
     def close(self) -> None:
         """Says the last line."""
@@ -143,8 +157,7 @@ class LineProgress(RunProgress):
         self._say(f"{self._prefix}{self._counts()}, {took}, {self.standing()}")
 
     def _show(self) -> None:
-        left = self.seconds_left
-        ahead = f", {duration(left)} left" if left is not None else ""
+        ahead = f", {self.time_left()} left" if self.seconds_left is not None else ""
         self._say(f"{self._prefix}{self._counts()}{ahead}, {self.standing()}")
 
     def _counts(self) -> str:
@@ -158,10 +171,16 @@ class BarProgress(RunProgress):
     interval = BAR_INTERVAL
 
     def __init__(
-        self, total_timesteps: int, threshold: float, consecutive: int, title: str = "", start_step: int = 0
+        self,
+        total_timesteps: int,
+        threshold: float,
+        consecutive: int,
+        title: str = "",
+        start_step: int = 0,
+        stops: bool = False,
     ) -> None:
         """Draws the bar on standard output."""
-        super().__init__(total_timesteps, threshold, consecutive, start_step)
+        super().__init__(total_timesteps, threshold, consecutive, start_step, stops=stops)
         self._title = title
         # rich puts stand-ins in their place that write above the bar.
         terminals = {stream: name for name in ("stdout", "stderr") if (stream := getattr(sys, name)).isatty()}
@@ -192,12 +211,9 @@ class BarProgress(RunProgress):
     def line(self, width: int) -> str:
         """The bar, with as much beside it as ``width`` columns take."""
         share = self._step / self._total
-        left = self.seconds_left
         steps = f"{self._step:,}/{self._total:,}"
         speed = f"{self.steps_per_second:,.0f} steps/s"
-        end = f"ETA {duration(left) if left is not None else '-'}"
-        if self._step >= self._total:
-            end = f"took {duration(self._clock() - self._started)}"
+        end = f"took {duration(self._clock() - self._started)}" if self.is_over else f"ETA {self.time_left()}"
         percent = f"{100 * share:3.0f}%"
         full = [percent, steps, speed, end, self.standing()]
         for words in ([self._title, None, *full], [None, *full], [None, percent, speed, end, self.standing()]):
@@ -216,17 +232,19 @@ def make_progress(
     consecutive: int = 5,
     title: str = "",
     start_step: int = 0,
+    stops: bool = False,
     say: Callable[[str], None] = lambda line: print(line, flush=True),
 ) -> RunProgress:
     """Shows how far a run is.
 
     Args:
         mode: ``bar``, ``lines``, ``off``, or ``auto``: a bar where standard output is a terminal, else lines.
-        total_timesteps: Steps that the run takes.
+        total_timesteps: Steps that the run takes at most.
         threshold: Return to reach.
         consecutive: Episodes running that must reach it.
         title: Name of the run.
         start_step: Steps that had been taken before.
+        stops: Whether the run ends once it has reached its threshold.
         say: Takes a line, in the mode ``lines``.
 
     Raises:
@@ -237,10 +255,10 @@ def make_progress(
     if mode == "auto":
         mode = "bar" if sys.stdout.isatty() and os.environ.get("TERM") not in (None, "", "dumb") else "lines"
     if mode == "bar":
-        return BarProgress(total_timesteps, threshold, consecutive, title, start_step)
+        return BarProgress(total_timesteps, threshold, consecutive, title, start_step, stops)
     if mode == "lines":
-        return LineProgress(total_timesteps, threshold, consecutive, title, start_step, say)
-    return RunProgress(total_timesteps, threshold, consecutive, start_step)
+        return LineProgress(total_timesteps, threshold, consecutive, title, start_step, say, stops=stops)
+    return RunProgress(total_timesteps, threshold, consecutive, start_step, stops=stops)
 
 
 def duration(seconds: float) -> str:

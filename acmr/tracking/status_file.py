@@ -24,7 +24,7 @@ class Heartbeat:
 
     Args:
         folder: The run's directory.
-        total_timesteps: Steps that the run takes.
+        total_timesteps: Steps that the run takes at most.
         start_step: Steps that had been taken before.
     """
 

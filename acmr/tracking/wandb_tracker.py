@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from acmr.config import TrackingConfig
+from acmr.config import THRESHOLD, TrackingConfig
 from acmr.records import CELLS, VELOCITY_COLUMN, EpisodeRecord
 from acmr.tracking import wandb_backend
 from acmr.tracking.wandb_backend import LONGEST, SERVER_WAIT, one_line
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 #: How often it is checked that rows reach the file, and how old a row may grow before it counts as lost, in seconds.
 ARRIVAL_CHECK = 15.0
+#: Tag of runs that end at their threshold.
+STOPPED = "stopped"
 
 
 class Tracker(Protocol):
@@ -199,7 +201,8 @@ def make_tracker(
 def _label(profile: str, run_name: str, seed: int, tags: Sequence[str]) -> str:
     """What tells a run apart in a few characters: ``A2-s3-paper``, or where it is no cell ``s3-ant-hidden-paper``."""
     cell = next((tag for tag in tags if tag in CELLS), None)
-    return f"{cell}-s{seed}-{profile}" if cell else f"s{seed}-{run_name}-{profile}"
+    ending = f"-{STOPPED}" if STOPPED in tags else ""
+    return f"{cell}-s{seed}-{profile}{ending}" if cell else f"s{seed}-{run_name}-{profile}"
 
 
 def labels(settings: Mapping[str, Any], run_name: str, cell: str | None) -> dict[str, Any]:
@@ -211,6 +214,8 @@ def labels(settings: Mapping[str, Any], run_name: str, cell: str | None) -> dict
         cell: The paper's name of the run, if it has one.
     """
     env, transfer, profile = settings["env"], str(settings["transfer"]["name"]), str(settings["profile"])
+    # Settings that were stored before there was a choice have none.
+    stops = settings.get("stop") == THRESHOLD
     teaches = transfer == "none" and env["name"] == env["source"]
     tags = [
         profile,
@@ -220,9 +225,9 @@ def labels(settings: Mapping[str, Any], run_name: str, cell: str | None) -> dict
         f"seed{settings['seed']}",
     ]
     return {
-        "group": f"{profile}/{cell or run_name}",
+        "group": f"{profile}/{cell if cell and not stops else run_name}",
         "job_type": "teacher" if teaches else "student",
-        "tags": [*tags, *([cell] if cell else [])],
+        "tags": [*tags, *([cell] if cell else []), *([STOPPED] if stops else [])],
     }
 
 
