@@ -14,8 +14,8 @@ from rich.text import Text
 
 from sweeps.estimate import Estimate
 from sweeps.folder import COMPLETE, DIVERGED, FAILED, FINAL, RUNNING, STOPPED, SweepFolder, SweepRun
-from sweeps.plan import Plan
-from sweeps.view import BLOCKED, LOST, RunStatus, counts, span, table, view_entries
+from sweeps.plan import Plan, PlannedRun
+from sweeps.view import BLOCKED, LOST, RunStatus, counts, span, steps_ahead, table, view_entries
 
 #: Seconds between two plain lines on how far everything is.
 LINE_INTERVAL = 60.0
@@ -89,7 +89,7 @@ class Display:
     def line(self) -> str:
         """How far the whole is."""
         speed = self._speed()
-        ahead = sum(view.total - view.step for view in self.views if view.state not in (*FINAL, BLOCKED))
+        ahead = steps_ahead(self.views)
         eta = f"; {speed:,.0f} steps/s, {span(ahead / speed)} left" if speed and ahead else ""
         return f"{counts(self.views)}{eta}"
 
@@ -123,7 +123,7 @@ class Display:
             self.say(f"{view.state}  {view.name} seed {view.seed}{detail}")
 
     def _steps(self) -> int:
-        return sum(view.total if view.state in FINAL else view.step for view in self.views)
+        return sum(view.step for view in self.views)
 
     def _speed(self) -> float:
         now = sum(view.speed for view in self.views if view.state == RUNNING)
@@ -149,8 +149,7 @@ def print_plan(plan: Plan, needs: Estimate, workers: int, output_dir: Path) -> N
     for run in plan.runs:
         cell = f"{run.spec.cell}  " if run.spec.cell else ""
         state = run.ended or f"stage {stage_of[run.index]}"
-        added = "  (added: the teacher of runs below)" if run.implied else ""
-        console.print(f"{state:<10} {cell}{run.spec.directory}{added}", markup=False, soft_wrap=True)
+        console.print(f"{state:<10} {cell}{run.spec.directory}{_remark(run)}", markup=False, soft_wrap=True)
     stages = ", then ".join(str(len(stage)) for stage in plan.stages)
     done = len(plan.runs) - len(plan.missing)
     console.print(
@@ -162,8 +161,17 @@ def print_plan(plan: Plan, needs: Estimate, workers: int, output_dir: Path) -> N
     time_needed = f"about {span(needs.seconds)}, {source}" if needs.seconds else "not known until a run is complete"
     console.print(f"workers: {workers}")
     console.print(f"time: {time_needed}", soft_wrap=True)
+    if needs.stops_like is not None:
+        guide = f"as {_number(needs.stops_like)} did" if needs.stops_like else "as late as they may: none has ended yet"
+        console.print(f"stop: the time counts on runs that meet their threshold {guide}", soft_wrap=True)
     console.print(f"memory: {_bytes(needs.memory)} at most, once the replay memories are full", soft_wrap=True)
     console.print(f"disk: {_bytes(needs.disk)} at most; {_bytes(needs.kept)} stay", soft_wrap=True)
+
+
+def _remark(run: PlannedRun) -> str:
+    if run.stands_for:
+        return f"  (in full, since it teaches: stands for {', '.join(run.stands_for)})"
+    return "  (added: the teacher of runs below)" if run.implied else ""
 
 
 def _number(count: int) -> str:

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from acmr.config import ExperimentConfig
+from acmr.config import THRESHOLD, ExperimentConfig
 from acmr.envs import describe
 from sweeps.folder import COMPLETE
 from sweeps.plan import Plan, PlannedRun
+from sweeps.view import Lengths, full_name
 
 #: Memory of a training beside its replay buffer: Python, torch and MuJoCo (measured, 64-bit Linux, CPU).
 _BASE_MEMORY = 450e6
 #: Disk of a finished run where none of its kind is there to look at: results, networks and mirror, an upper limit.
 _RESULT_DISK = 20e6
-#: Profile and name of runs that differ in the seed only: they are equally fast.
+#: Profile and name of runs that differ in the seed or in where they stop only: they are equally fast.
 _Kind = tuple[str, str]
 
 
@@ -31,6 +34,7 @@ class Estimate:
         memory: Most memory at a time, in bytes; None: not known.
         disk: Most disk at a time, in bytes; None: not known.
         kept: Disk that stays, in bytes.
+        stops_like: How many finished runs say when those that stop at their threshold do; None: no run stops.
     """
 
     seconds: float | None
@@ -38,13 +42,19 @@ class Estimate:
     memory: float | None
     disk: float | None
     kept: float
+    stops_like: int | None = None
 
 
 def estimate(plan: Plan, output_dir: Path, workers: int) -> Estimate:
     """Works out what the missing runs of a plan need when ``workers`` are trained at a time."""
-    speeds = _speeds(output_dir)
+    finished = _finished(output_dir)
+    speeds, lengths = _speeds(finished), _lengths(finished)
     models = {run.index: _models(run, speeds) for run in plan.missing}
-    seconds = {run.index: _seconds(run, [speeds[name] for name in models[run.index]]) for run in plan.missing}
+    steps = {run.index: lengths.expect(run.spec.directory, run.spec.config.most_steps) for run in plan.missing}
+    seconds = {
+        run.index: _seconds(steps[run.index], [speeds[name] for name in models[run.index]]) for run in plan.missing
+    }
+    stopping = [run for run in plan.missing if run.spec.config.stop == THRESHOLD]
     buffers = sorted((_buffer_bytes(run.spec.config) for run in plan.missing), key=lambda size: -(size or 0))
     largest = buffers[:workers]
     known = [size for size in largest if size is not None]
@@ -58,32 +68,48 @@ def estimate(plan: Plan, output_dir: Path, workers: int) -> Estimate:
         memory=sum(known) + _BASE_MEMORY * len(largest) if complete else None,
         disk=sum(known) * 1.1 + kept if complete else None,
         kept=kept,
+        stops_like=max(len(lengths.like(run.spec.directory)) for run in stopping) if stopping else None,
     )
 
 
-def _speeds(output_dir: Path) -> dict[_Kind, list[float]]:
+def _finished(output_dir: Path) -> dict[Path, dict[str, Any]]:
+    """Summaries of complete runs, by directory."""
+    found: dict[Path, dict[str, Any]] = {}
+    for path in output_dir.glob("*/*/seed_*/summary.json"):
+        with suppress(OSError, ValueError):
+            summary = json.loads(path.read_text(encoding="utf-8"))
+            if summary.get("status") == COMPLETE:
+                found[path.parent] = summary
+    return found
+
+
+def _speeds(finished: Mapping[Path, Mapping[str, Any]]) -> dict[_Kind, list[float]]:
     """Steps per second of finished runs, by profile and name."""
     found: dict[_Kind, list[float]] = {}
-    for path in output_dir.glob("*/*/seed_*/summary.json"):
-        try:
-            summary = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            continue
-        speed = summary.get("steps_per_second")
-        if summary.get("status") == COMPLETE and speed:
-            found.setdefault((path.parts[-4], path.parts[-3]), []).append(float(speed))
+    for directory, summary in finished.items():
+        if speed := summary.get("steps_per_second"):
+            kind = (directory.parts[-3], full_name(directory.parts[-2]))
+            found.setdefault(kind, []).append(float(speed))
+    return found
+
+
+def _lengths(finished: Mapping[Path, Mapping[str, Any]]) -> Lengths:
+    found = Lengths()
+    for directory, summary in finished.items():
+        if needed := summary.get("steps_to_threshold") or summary.get("global_step"):
+            found.add(directory, int(needed))
     return found
 
 
 def _models(run: PlannedRun, speeds: dict[_Kind, list[float]]) -> list[_Kind]:
     """Whose speed a run is expected to have: its own with other seeds, else for want of better its whole profile."""
-    profile, same = run.spec.config.profile, (run.spec.config.profile, run.spec.name)
+    profile, same = run.spec.config.profile, (run.spec.config.profile, full_name(run.spec.name))
     return [same] if same in speeds else [kind for kind in speeds if kind[0] == profile]
 
 
-def _seconds(run: PlannedRun, speeds: list[list[float]]) -> float | None:
+def _seconds(steps: float, speeds: list[list[float]]) -> float | None:
     values = [speed for of_kind in speeds for speed in of_kind]
-    return run.spec.config.total_timesteps / statistics.fmean(values) if values else None
+    return steps / statistics.fmean(values) if values else None
 
 
 def _makespan(plan: Plan, seconds: dict[int, float], workers: int) -> float:
@@ -115,7 +141,7 @@ def _buffer_bytes(config: ExperimentConfig) -> float | None:
         # The plan is printed all the same; the run itself will say what is wrong with its environment.
         return None
     row = 4 * (len(about.observation_names) + len(about.action_names) + 3)
-    return float(row * min(config.agent.buffer_size, config.total_timesteps))
+    return float(row * min(config.agent.buffer_size, config.most_steps))
 
 
 def _kept_bytes(run: PlannedRun) -> float:

@@ -36,7 +36,7 @@ class SweepRun:
         cell: The paper's name of the experiment, if it has one.
         seed: Its seed.
         directory: Where it lies, from the folder of all runs.
-        total_timesteps: Steps that it takes.
+        total_timesteps: Steps that it takes at most.
         threads: Threads that it uses.
         teacher: Index of the run that has to be complete before it starts.
         ended: ``complete`` or ``diverged``, if it was there before the sweep.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
-from acmr.config import ConfigError, ExperimentConfig
+from acmr.config import HORIZON, THRESHOLD, ConfigError, ExperimentConfig
 from acmr.settings.compose import compose_config, parse
 from acmr.settings.errors import check_booleans
 from acmr.settings.run_spec import RunSpec, specify, teacher_spec
@@ -28,6 +28,7 @@ class PlannedRun:
         ended: ``complete`` or ``diverged``, if it is there already.
         teacher: Index of the run that has to be complete before this one starts.
         implied: Whether it was not asked for, but is the teacher of a run that was.
+        stands_for: Names of runs that were asked for and stop early, of which it is the full one.
     """
 
     index: int
@@ -35,6 +36,7 @@ class PlannedRun:
     ended: str | None
     teacher: int | None = None
     implied: bool = False
+    stands_for: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def effort(run: PlannedRun) -> float:
     config = run.spec.config
     sizes = config.agent.hidden_sizes
     products = sum(a * b for a, b in pairwise(sizes)) + sizes[0]
-    return float(config.total_timesteps) * config.agent.batch_size * products
+    return float(config.most_steps) * config.agent.batch_size * products
 
 
 def expand(jobs: Iterable[Sequence[str]]) -> list[RunSpec]:
@@ -98,12 +100,20 @@ def expand(jobs: Iterable[Sequence[str]]) -> list[RunSpec]:
 def make_plan(specs: Sequence[RunSpec]) -> Plan:
     """Adds the teachers that students imply, and finds out what is there already.
 
+    A run that stops at its threshold is not made where the full one, whose beginning it is, teaches another of them.
+
     Args:
         specs: Runs in different directories.
 
     Raises:
         ConfigError: If a directory holds a run with other settings, or if a teacher that is named is not there.
     """
+    full_runs = _full_runs(specs)
+    stands_for: dict[Path, tuple[str, ...]] = {}
+    for spec in specs:
+        if (full := full_runs.get(spec.directory)) is not None:
+            stands_for[full.directory] = (*stands_for.get(full.directory, ()), spec.name)
+    specs = [full_runs.get(spec.directory, spec) for spec in specs]
     listed = {spec.directory: spec for spec in specs}
     ended = {directory: _ended(spec) for directory, spec in listed.items()}
     students = [spec for spec in specs if ended[spec.directory] is None]
@@ -124,9 +134,25 @@ def make_plan(specs: Sequence[RunSpec]) -> Plan:
                 ended=ended[path],
                 teacher=index.get(teacher.directory) if teacher else None,
                 implied=path in needed,
+                stands_for=stands_for.get(path, ()),
             )
         )
     return Plan(tuple(runs))
+
+
+def _full_runs(specs: Sequence[RunSpec]) -> dict[Path, RunSpec]:
+    """For the directory of each run that stops: the full one, if that teaches a run of the sweep, trained or not.
+
+    Students that are complete count, too: the same command means the same runs when it is typed again.
+    """
+    full = {
+        spec.directory: specify(replace(spec.config, stop=HORIZON, stop_after=None))
+        for spec in specs
+        if spec.config.stop == THRESHOLD and spec.config.transfer.name == "none"
+    }
+    students = [spec for spec in specs if full and spec.config.transfer.name != "none"]
+    teaching = {teacher_spec(spec.config).directory for spec in students if spec.config.transfer.teacher is None}
+    return {directory: spec for directory, spec in full.items() if spec.directory in teaching}
 
 
 def _teacher(config: ExperimentConfig) -> RunSpec | None:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sweeps.folder import FAILED, FINAL, RUNNING, WAITING, State, SweepFolder, SweepRun, all_folders
-from sweeps.view import BLOCKED, LOST, RunStatus, counts, span, table, view_entries, view_run
+from sweeps.folder import FAILED, RUNNING, WAITING, State, SweepFolder, SweepRun, all_folders
+from sweeps.view import BLOCKED, LOST, RunStatus, counts, span, steps_ahead, table, view_entries, view_run
 
 #: States for which somebody has to do something.
 _BAD = (FAILED, LOST, BLOCKED)
@@ -77,8 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say(console, line, color)
     running = [view for view in views if view.state == RUNNING]
     speed = sum(view.speed for view in running)
-    ahead = sum(view.total - view.step for view in views if view.state not in FINAL and view.state != BLOCKED)
-    eta = f"; {speed:,.0f} steps/s, {span(ahead / speed)} left" if speed else ""
+    eta = f"; {speed:,.0f} steps/s, {span(steps_ahead(views) / speed)} left" if speed else ""
     _say(console, f"{len(views)} runs: {counts(views)}{eta}")
     return 1 if any(view.state in _BAD for view in views) else 0
 

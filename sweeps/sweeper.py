@@ -220,7 +220,7 @@ def entries_of(plan: Plan, output_dir: Path) -> list[SweepRun]:
             cell=run.spec.cell,
             seed=run.spec.config.seed,
             directory=os.path.relpath(run.spec.directory, output_dir),
-            total_timesteps=run.spec.config.total_timesteps,
+            total_timesteps=run.spec.config.most_steps,
             threads=run.spec.config.threads,
             teacher=run.teacher,
             ended=run.ended,

@@ -1,9 +1,14 @@
-"""How far runs are: read from their directories, shown as a table. Imports nothing heavy."""
+"""How far runs are, and how far they have to go: read from their directories, shown as a table.
+
+Imports nothing heavy.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import re
+import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from acmr.tracking.status_file import read_status
-from sweeps.folder import COMPLETE, DIVERGED, FAILED, RUNNING, STOPPED, WAITING, State, SweepRun, is_alive
+from sweeps.folder import COMPLETE, DIVERGED, FAILED, FINAL, RUNNING, STOPPED, WAITING, State, SweepRun, is_alive
 
 #: A run that says it is running, but whose process is gone or has said nothing for so many seconds.
 LOST, SILENCE = "lost", 600.0
 BLOCKED = "blocked"
+#: How a run's name spells that it stops at its threshold (``acmr.settings.run_spec``).
+_STOP = re.compile(r"-stop=threshold(-stop_after=\d+)?(?=-|$)")
 _HEADER = ["run", "seed", "state", "step", "steps/s", "ETA", "return", ""]
 _LEFT = ("run", "state", "")
 _COLORS = {COMPLETE: "green", DIVERGED: "magenta", FAILED: "red", RUNNING: "cyan", LOST: "red", BLOCKED: "red"}
@@ -31,10 +38,11 @@ class RunStatus:
         directory: Where it lies.
         state: ``waiting``, ``running``, ``complete``, ``diverged``, ``failed``, ``stopped``, ``lost`` or ``blocked``.
         step: Environment steps taken.
-        total: Those that it takes, 0 if not known.
+        total: Those that it takes at most, 0 if not known; of a complete run those that it took.
         speed: Steps per second: now, or over the whole of a complete run.
         latest: Latest return; of a complete run the mean of its last ones.
         reason: Why it is in this state, if there is something to say.
+        met: Steps until a complete run met its threshold, if it did.
     """
 
     name: str
@@ -46,10 +54,11 @@ class RunStatus:
     speed: float = 0.0
     latest: float | None = None
     reason: str = ""
+    met: int | None = None
 
     @property
     def seconds_left(self) -> float | None:
-        """Time to its end at the present speed."""
+        """Time to its end, the latest that it may have, at the present speed."""
         return (self.total - self.step) / self.speed if self.state == RUNNING and self.speed > 0 else None
 
 
@@ -66,8 +75,9 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
     summary = None if state and state.state == RUNNING else _summary(directory)
     if summary is not None and summary.get("status") in (COMPLETE, DIVERGED):
         step, speed = int(summary.get("global_step") or 0), float(summary.get("steps_per_second") or 0)
-        total = int(summary.get("total_timesteps") or total)
-        return RunStatus(name, seed, directory, summary["status"], step, total, speed, summary.get("final_return"))
+        state_now, met = summary["status"], summary.get("steps_to_threshold")
+        total = step if state_now == COMPLETE else int(summary.get("total_timesteps") or total)
+        return RunStatus(name, seed, directory, state_now, step, total, speed, summary.get("final_return"), met=met)
     status = read_status(directory) or {}
     alive = status.get("state") == RUNNING and _is_alive(status)
     told, reason = _told(status, state or State(STOPPED), alive)
@@ -135,6 +145,61 @@ def counts(views: Iterable[RunStatus]) -> str:
     return ", ".join(f"{numbers[state]} {state}" for state in order if state in numbers) or "no runs"
 
 
+def stops(name: str) -> bool:
+    """Whether the run of this name ends once it has met its threshold."""
+    return _STOP.search(name) is not None
+
+
+def full_name(name: str) -> str:
+    """The name of the run that takes all steps, of which the run of this name is the beginning or the whole."""
+    return _STOP.sub("", name)
+
+
+class Lengths:
+    """Steps that runs needed to meet their thresholds, those included that came to their end before.
+
+    Full runs tell as much as stopped ones, since a stopped run is the beginning of the full one. Runs are told apart by
+    profile and name, both of which are parts of their directories: ``<output_dir>/<profile>/<name>/seed_<n>``.
+    """
+
+    def __init__(self) -> None:
+        self._needed: dict[tuple[str, str], list[int]] = {}
+
+    def add(self, directory: Path, needed: int) -> None:
+        """Notes a complete run, and the steps until it met its threshold or, if it never did, came to its end."""
+        self._needed.setdefault(_kind(directory), []).append(needed)
+
+    def like(self, directory: Path) -> list[int]:
+        """What runs needed that differ in the seed or in where they stop; for want of them, all of the same profile."""
+        profile, name = _kind(directory)
+        same = self._needed.get((profile, name))
+        return same or [needed for kind, ends in self._needed.items() if kind[0] == profile for needed in ends]
+
+    def expect(self, directory: Path, most: int, step: int = 0) -> float:
+        """Steps that a run will have taken at its end.
+
+        Args:
+            directory: Where the run lies.
+            most: Steps after which it ends at the latest.
+            step: Steps that it has taken.
+        """
+        if not stops(directory.parts[-2]):
+            return float(most)
+        # Runs that ended sooner are no guide to one that has come further.
+        later = [min(needed, most) for needed in self.like(directory) if needed > step]
+        return statistics.fmean(later) if later else float(most)
+
+
+def steps_ahead(views: Sequence[RunStatus]) -> float:
+    """Steps that are left to take; a run that stops at its threshold is expected to end where such runs did so far."""
+    lengths = Lengths()
+    for view in views:
+        if view.state == COMPLETE:
+            lengths.add(view.directory, view.met or view.step)
+    ahead = [view for view in views if view.state not in (*FINAL, BLOCKED)]
+    return sum(lengths.expect(view.directory, view.total, view.step) - view.step for view in ahead)
+
+
 def span(seconds: float | None) -> str:
     """A time to read: ``8 s``, ``12:05``, ``3:07:09``, ``2 d 3 h``."""
     if seconds is None:
@@ -149,6 +214,10 @@ def span(seconds: float | None) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
+def _kind(directory: Path) -> tuple[str, str]:
+    return directory.parts[-3], full_name(directory.parts[-2])
+
+
 def _cells(view: RunStatus) -> list[str]:
     share = f" {100 * view.step / view.total:3.0f}%" if view.total else ""
     return [
@@ -157,7 +226,7 @@ def _cells(view: RunStatus) -> list[str]:
         view.state,
         f"{view.step:,}{share}" if view.step else "-",
         f"{view.speed:,.0f}" if view.speed else "-",
-        span(view.seconds_left),
+        f"{'<' if stops(view.directory.parts[-2]) and view.seconds_left else ''}{span(view.seconds_left)}",
         f"{view.latest:,.0f}" if view.latest is not None else "-",
         view.reason,
     ]
