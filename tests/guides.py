@@ -35,7 +35,7 @@ def copy_checkout(folder: Path) -> Path:
 
 
 def follow(guide: Path, folder: Path) -> str:
-    """Writes the files of a guide into a folder and runs its bash blocks there, in their order; returns what they say."""
+    """Writes the files of a guide into a folder and runs its bash blocks there in order; returns what they say."""
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
     said = ""
     for block in blocks(guide):
