@@ -1,22 +1,46 @@
-"""What a run leaves behind, and the one measure that the paper takes from it.
+"""The contract of a run's directory: its files, its states, its columns, and the measure that the paper takes from it.
 
-Free of torch, Hydra and W&B, so that the analysis can import it.
+What ``acmr`` writes, ``sweeps`` watches and ``analysis`` reads is agreed here and nowhere else. Standard library only,
+so that none of them has to load what the others need.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-#: States of a run that has ended, as ``summary.json`` names them.
-COMPLETE, DIVERGED = "complete", "diverged"
+#: Every setting of a run; written first, so that a directory which holds a run has it.
+CONFIG_FILE = "config.yaml"
+#: One row an episode, one row ``log_every`` steps.
+EPISODES_FILE, METRICS_FILE = "episodes.csv", "metrics.csv"
+#: What was copied, fresh and frozen.
+TRANSFER_FILE = "transfer.json"
+#: Written last: a run that has it came to its end.
+SUMMARY_FILE = "summary.json"
+#: What the run is doing right now, and what was said, with times.
+STATUS_FILE, LOG_FILE = "status.json", "run.log"
 #: The final networks of a run, and their description.
 TENSOR_FILE, DESCRIPTION_FILE = "teacher.safetensors", "teacher.json"
+#: What ``python -m acmr.evaluation`` adds afterwards.
+EVALUATION_FILE = "evaluation.json"
+#: A run's place below the folder of all runs, as a pattern: ``<profile>/<name>/seed_<n>``.
+RUN_PATTERN = "*/*/seed_*"
+SEED_FOLDER = re.compile(r"seed_(\d+)")
+
+#: States of a run that is under way or was ended early, as ``status.json`` names them.
+RUNNING, STOPPED = "running", "stopped"
+#: States of a run that came to its end, as ``status.json`` and ``summary.json`` name them.
+COMPLETE, DIVERGED = "complete", "diverged"
+ENDED = (COMPLETE, DIVERGED)
+
 #: The first columns of every ``episodes.csv``; a file with only these is complete.
 EPISODE_COLUMNS = ("global_step", "episodic_return", "episode_length")
 #: Further columns, where the environment reports them; ``reward_*`` columns (sums of the reward's terms) follow.
 VELOCITY_COLUMN = "mean_forward_velocity"
+#: The first columns of every ``metrics.csv``; those of the learner follow.
+METRIC_COLUMNS = ("global_step", "steps_per_second")
 #: What an environment's ``info`` calls its forward velocity, in m/s.
 VELOCITY_KEY = "x_velocity"
 
@@ -30,6 +54,10 @@ CELLS: dict[str, tuple[str, str, bool]] = {
     "A3": ("target", "expand", False),
     "A4": ("target", "expand", True),
 }
+
+
+class DamagedError(Exception):
+    """A file of a run does not hold what was written to it. The message says which file and what is wrong."""
 
 
 @dataclass(frozen=True)

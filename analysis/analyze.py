@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from acmr.records import CELLS
+from acmr.records import CELLS, SUMMARY_FILE
 from analysis.loading.load import InputError, RunSet
 from analysis.loading.missing import Missing, missing_runs, planned_seeds
 from analysis.statistics.comparisons import check_reference, compare_cells, compare_groups
@@ -103,7 +103,7 @@ def _check_summaries(measured: pd.DataFrame, own: bool) -> pd.DataFrame:
     told = measured["steps_in_summary"]
     odd = told.notna() & (told != measured["steps_to_threshold"])
     for name in measured.index[odd]:
-        note = f"summary.json says {told[name]:,.0f} steps to threshold, its episodes say otherwise"
+        note = f"{SUMMARY_FILE} says {told[name]:,.0f} steps to threshold, its episodes say otherwise"
         reason = measured.loc[name, "reason"]
         measured.loc[name, "reason"] = f"{reason}; {note}" if reason else note
     return measured

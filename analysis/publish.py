@@ -15,10 +15,22 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from acmr.records import (
+    COMPLETE,
+    CONFIG_FILE,
+    DESCRIPTION_FILE,
+    ENDED,
+    EPISODES_FILE,
+    METRICS_FILE,
+    SUMMARY_FILE,
+    TENSOR_FILE,
+    TRANSFER_FILE,
+)
+
 #: A file above this is compressed.
 LARGE = 1_000_000
-RECORDS = ("config.yaml", "summary.json", "episodes.csv", "metrics.csv", "transfer.json")
-TEACHER = ("teacher.safetensors", "teacher.json")
+RECORDS = (CONFIG_FILE, SUMMARY_FILE, EPISODES_FILE, METRICS_FILE, TRANSFER_FILE)
+TEACHER = (TENSOR_FILE, DESCRIPTION_FILE)
 
 
 class PublishError(ValueError):
@@ -38,7 +50,7 @@ def publish(runs: Path, out: Path) -> tuple[list[Path], list[Path]]:
     Raises:
         PublishError: If there is nothing to publish, or ``out`` holds other results of a run; then nothing is written.
     """
-    found = {path.parent.relative_to(runs): _files(path.parent) for path in sorted(runs.glob("**/summary.json"))}
+    found = {path.parent.relative_to(runs): _files(path.parent) for path in sorted(runs.glob(f"**/{SUMMARY_FILE}"))}
     found = {run: files for run, files in found.items() if files}
     if not found:
         raise PublishError(f"{runs}: no run has come to its end there; make status says how far they are")
@@ -60,17 +72,17 @@ def publish(runs: Path, out: Path) -> tuple[list[Path], list[Path]]:
 def _files(run: Path) -> dict[str, bytes]:
     """Names and contents of what is published of a run; nothing if it has not come to its end."""
     try:
-        summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+        summary = json.loads((run / SUMMARY_FILE).read_text(encoding="utf-8"))
     except ValueError:
-        raise PublishError(f"{run / 'summary.json'}: cannot be read; move that run away, or make it anew") from None
-    if summary.get("status") not in ("complete", "diverged"):
+        raise PublishError(f"{run / SUMMARY_FILE}: cannot be read; move that run away, or make it anew") from None
+    if summary.get("status") not in ENDED:
         return {}
     names = (*RECORDS, *(TEACHER if _teaches(summary) else ()))
     return dict(_packed(run / name) for name in names if (run / name).is_file())
 
 
 def _teaches(summary: dict[str, Any]) -> bool:
-    return summary.get("cell") == "H0" and summary["status"] == "complete"
+    return summary.get("cell") == "H0" and summary["status"] == COMPLETE
 
 
 def _packed(path: Path) -> tuple[str, bytes]:

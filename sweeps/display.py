@@ -12,8 +12,9 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from acmr.records import COMPLETE, DIVERGED, ENDED, RUNNING, STOPPED
 from sweeps.estimate import Estimate
-from sweeps.folder import COMPLETE, DIVERGED, FAILED, FINAL, RUNNING, STOPPED, SweepFolder, SweepRun
+from sweeps.folder import FAILED, FINAL, WAITING, SweepFolder, SweepRun
 from sweeps.plan import Plan, PlannedRun
 from sweeps.view import BLOCKED, LOST, RunStatus, counts, span, steps_ahead, table, view_entries
 
@@ -54,7 +55,7 @@ class Display:
     def refresh(self) -> None:
         """Looks at all runs that have not ended."""
         self._looked_at = time.monotonic()
-        known = {index: view for index, view in enumerate(self.views) if view.state in (COMPLETE, DIVERGED)}
+        known = {index: view for index, view in enumerate(self.views) if view.state in ENDED}
         if len(known) < len(self._entries):
             states = [self._folder.state(entry.index) for entry in self._entries]
             self.views = view_entries(self._output_dir, self._entries, states, known)
@@ -135,7 +136,7 @@ class Display:
         shown = self.views
         if len(shown) > height:
             # What runs or went wrong first; the rest is in the line below.
-            quiet = (COMPLETE, "waiting")
+            quiet = (COMPLETE, WAITING)
             shown = sorted(self.views, key=lambda view: (view.state in quiet, view.state))[:height]
         text = Text(self.line(), style="bold", no_wrap=True, overflow="ellipsis")
         lines = [Text(line, style=color or "", no_wrap=True, overflow="ellipsis") for line, color in table(shown)]

@@ -12,7 +12,7 @@ from typing import Any
 
 from acmr.config import THRESHOLD, ExperimentConfig
 from acmr.envs import describe
-from sweeps.folder import COMPLETE
+from acmr.records import COMPLETE, RUN_PATTERN, SUMMARY_FILE
 from sweeps.plan import Plan, PlannedRun
 from sweeps.view import Lengths, full_name
 
@@ -75,7 +75,7 @@ def estimate(plan: Plan, output_dir: Path, workers: int) -> Estimate:
 def _finished(output_dir: Path) -> dict[Path, dict[str, Any]]:
     """Summaries of complete runs, by directory."""
     found: dict[Path, dict[str, Any]] = {}
-    for path in output_dir.glob("*/*/seed_*/summary.json"):
+    for path in output_dir.glob(f"{RUN_PATTERN}/{SUMMARY_FILE}"):
         with suppress(OSError, ValueError):
             summary = json.loads(path.read_text(encoding="utf-8"))
             if summary.get("status") == COMPLETE:
@@ -145,7 +145,7 @@ def _buffer_bytes(config: ExperimentConfig) -> float | None:
 
 
 def _kept_bytes(run: PlannedRun) -> float:
-    alike = [path.parent for path in run.spec.directory.parent.glob("seed_*/summary.json")]
+    alike = [path.parent for path in run.spec.directory.parent.glob(f"*/{SUMMARY_FILE}")]
     sizes = [_size(folder.iterdir()) for folder in alike]
     return statistics.fmean(sizes) if sizes else _RESULT_DISK
 

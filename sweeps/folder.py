@@ -17,11 +17,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from acmr.records import ENDED
+
 SWEEPS = ".sweeps"
-WAITING, RUNNING, FAILED, STOPPED = "waiting", "running", "failed", "stopped"
-COMPLETE, DIVERGED = "complete", "diverged"
+#: States of a run of a sweep, beside those that it says itself.
+WAITING, FAILED = "waiting", "failed"
 #: States that a run does not leave within its sweep.
-FINAL = (COMPLETE, DIVERGED, FAILED)
+FINAL = (*ENDED, FAILED)
 #: Folders of former sweeps that are kept.
 _KEPT = 10
 

@@ -18,6 +18,7 @@ from typing import IO
 from omegaconf import OmegaConf
 
 from acmr.config import ExperimentConfig
+from acmr.records import CONFIG_FILE
 from acmr.settings import compose
 from acmr.settings.run_spec import RunSpec
 
@@ -57,7 +58,7 @@ def adopt(path: Path) -> RunSpec:
     # The student's teacher follows from these files, which nobody edits.
     compose.CONFIG_FOLDER = path.parent.parent / "conf"
     spec = read_job(path)
-    begun, planned = spec.directory / "config.yaml", path.parent.parent / "plan.json"
+    begun, planned = spec.directory / CONFIG_FILE, path.parent.parent / "plan.json"
     if begun.exists() and begun.stat().st_mtime_ns > planned.stat().st_mtime_ns:
         # This sweep has begun it anew already; to be asked for once is to be done once.
         spec = replace(spec, config=replace(spec.config, force=False))

@@ -8,11 +8,11 @@ from itertools import pairwise
 from pathlib import Path
 
 from acmr.config import HORIZON, THRESHOLD, ConfigError, ExperimentConfig
+from acmr.records import COMPLETE, ENDED
 from acmr.settings.compose import compose_config, parse
 from acmr.settings.errors import check_booleans
 from acmr.settings.run_spec import RunSpec, specify, teacher_spec
 from acmr.storage.run_dir import RunDir, holds_run
-from sweeps.folder import COMPLETE, DIVERGED
 
 #: Settings that a teacher takes over from its student because they change nothing in its result.
 _SHARED_KEYS = ("device", "threads", "progress", "log_every", "tracking", "checkpoint_every", "resume")
@@ -174,7 +174,7 @@ def _ended(spec: RunSpec) -> str | None:
     if not holds_run(run_dir, spec.config):
         return None
     status = (run_dir.summary() or {}).get("status")
-    return str(status) if status in (COMPLETE, DIVERGED) else None
+    return str(status) if status in ENDED else None
 
 
 def _difference(ours: Sequence[str], theirs: Sequence[str]) -> tuple[str, str]:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sweeps.folder import FAILED, RUNNING, WAITING, State, SweepFolder, SweepRun, all_folders
+from acmr.records import CONFIG_FILE, RUN_PATTERN, RUNNING, SEED_FOLDER, STATUS_FILE
+from sweeps.folder import FAILED, WAITING, State, SweepFolder, SweepRun, all_folders
 from sweeps.view import BLOCKED, LOST, RunStatus, counts, span, steps_ahead, table, view_entries, view_run
 
 #: States for which somebody has to do something.
@@ -20,7 +21,7 @@ _BAD = (FAILED, LOST, BLOCKED)
 def all_runs(output_dir: Path) -> list[RunStatus]:
     """Every run below a folder, and those that its latest sweep has not begun yet."""
     planned = _planned(output_dir)
-    found = {path.parent for name in ("config.yaml", "status.json") for path in output_dir.glob(f"*/*/seed_*/{name}")}
+    found = {path.parent for name in (CONFIG_FILE, STATUS_FILE) for path in output_dir.glob(f"{RUN_PATTERN}/{name}")}
     views = {view.directory: view for view in planned}
     for directory in found - set(views):
         views[directory] = view_run(directory, f"{directory.parts[-3]}/{directory.parts[-2]}", _seed(directory))
@@ -52,8 +53,8 @@ def _with_profile(view: RunStatus) -> RunStatus:
 
 
 def _seed(directory: Path) -> int:
-    number = directory.name.removeprefix("seed_")
-    return int(number) if number.isdigit() else 0
+    match = SEED_FOLDER.fullmatch(directory.name)
+    return int(match[1]) if match else 0
 
 
 def _say(console: Console, line: str, color: str | None = None) -> None:

@@ -17,11 +17,12 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig
 
 from acmr.config import ConfigError
+from acmr.records import COMPLETE, RUNNING, STOPPED
 from acmr.settings.compose import CONFIG_FOLDER
 from sweeps.display import Display, print_plan
 from sweeps.engine import LauncherAdapter, make_engine
 from sweeps.estimate import estimate
-from sweeps.folder import COMPLETE, FAILED, FINAL, RUNNING, STOPPED, State, SweepFolder, SweepRun, all_folders
+from sweeps.folder import FAILED, FINAL, State, SweepFolder, SweepRun, all_folders
 from sweeps.job import STOP_SIGNALS, write_job
 from sweeps.launch import Launch
 from sweeps.plan import Plan, expand, make_plan

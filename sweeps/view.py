@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from acmr.records import COMPLETE, DIVERGED, ENDED, RUNNING, STOPPED, SUMMARY_FILE
 from acmr.tracking.status_file import read_status
-from sweeps.folder import COMPLETE, DIVERGED, FAILED, FINAL, RUNNING, STOPPED, WAITING, State, SweepRun, is_alive
+from sweeps.folder import FAILED, FINAL, WAITING, State, SweepRun, is_alive
 
 #: A run that says it is running, but whose process is gone or has said nothing for so many seconds.
 LOST, SILENCE = "lost", 600.0
@@ -73,7 +74,7 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
         state: What the sweep that it belongs to knows of it.
     """
     summary = None if state and state.state == RUNNING else _summary(directory)
-    if summary is not None and summary.get("status") in (COMPLETE, DIVERGED):
+    if summary is not None and summary.get("status") in ENDED:
         step, speed = int(summary.get("global_step") or 0), float(summary.get("steps_per_second") or 0)
         state_now, met = summary["status"], summary.get("steps_to_threshold")
         total = step if state_now == COMPLETE else int(summary.get("total_timesteps") or total)
@@ -249,12 +250,12 @@ def _is_alive(status: dict[str, Any]) -> bool:
 
 
 def _verb(state: str) -> str:
-    return {DIVERGED: "diverged", FAILED: "failed", BLOCKED: "cannot start"}[state]
+    return "cannot start" if state == BLOCKED else state
 
 
 def _summary(directory: Path) -> dict[str, Any] | None:
     try:
-        content = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+        content = json.loads((directory / SUMMARY_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     return content if isinstance(content, dict) else None

@@ -12,8 +12,9 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from acmr.config import ConfigError
+from acmr.records import COMPLETE, ENDED, RUNNING, STOPPED
 from acmr.storage.run_dir import RunDir
-from sweeps.folder import COMPLETE, DIVERGED, FAILED, FINAL, RUNNING, STOPPED, State, SweepFolder, SweepRun
+from sweeps.folder import FAILED, FINAL, State, SweepFolder, SweepRun
 from sweeps.job import STOP_SIGNALS, TrainingProcess
 
 #: The run that a job takes up where it may choose.
@@ -107,7 +108,7 @@ class Worker:
             self._folder.set_state(index, replace(state, state=RUNNING))
             code, words = self._attempt(self._entries[index])
             outcome = self._outcome(index, code)
-            if outcome in (COMPLETE, DIVERGED, STOPPED):
+            if outcome in (*ENDED, STOPPED):
                 self._folder.set_state(index, replace(state, state=outcome, reason=""))
                 return
             if code == HELD and time.monotonic() - held_since < PATIENCE and not self._is_over():
@@ -138,7 +139,7 @@ class Worker:
             with suppress(ConfigError):
                 summary = RunDir(self._folder.output_dir / self._entries[index].directory).summary()
                 status = (summary or {}).get("status")
-                return str(status) if status in (COMPLETE, DIVERGED) else FAILED
+                return str(status) if status in ENDED else FAILED
             return FAILED
         return STOPPED if self._is_over() else FAILED
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from acmr import records
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("acmr", "analysis", "sweeps")
 #: Modules of one package; a longer list is no map.
@@ -47,6 +49,17 @@ def imports(path: Path) -> set[str]:
             inner = {f"{node.module}.{alias.name}" for alias in node.names} & MODULES.keys()
             found |= inner or {node.module}
     return found
+
+
+def literals(path: Path) -> set[str]:
+    """Every string in a file's code; docstrings are left out."""
+    tree = ast.parse(path.read_text())
+    values = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
+    return {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in values
+    }
 
 
 def part_of(module: str) -> str:
@@ -100,6 +113,17 @@ def test_there_is_no_circle_and_nobody_imports_a_command_line():
     # Raises CycleError with the circle.
     TopologicalSorter(graph).prepare()
     assert not [module for module, found in graph.items() if any(name.endswith("__main__") for name in found)]
+
+
+def test_the_files_of_a_run_and_its_states_are_named_in_records_only():
+    files = {value for name, value in vars(records).items() if name.endswith("_FILE")}
+    assert len(files) == 10
+    for path in sources(*PACKAGES):
+        if path == Path(records.__file__):
+            continue
+        for text in literals(path):
+            assert not [name for name in files if name in text], f"{names(path)}: {text}"
+            assert text not in (*records.ENDED, records.RUNNING), f"{names(path)}: {text}"
 
 
 def test_no_package_has_too_many_modules():

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from acmr.records import DamagedError
 from acmr.storage import durable
 from acmr.storage.durable import (
     Appender,
-    DamagedError,
     FileDigest,
     WriteError,
     make_folder,

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from sweeps.folder import FAILED, RUNNING, STOPPED, State, SweepFolder, SweepRun, all_folders
+from acmr.records import RUNNING, STOPPED
+from sweeps.folder import FAILED, State, SweepFolder, SweepRun, all_folders
 from sweeps.status import main
 from sweeps.view import counts, span, view_entries, view_run
 

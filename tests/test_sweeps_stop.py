@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 from acmr.config import ExperimentConfig
+from acmr.records import RUNNING
 from acmr.settings.compose import compose_config, parse
 from acmr.settings.run_spec import RunSpec, specify
 from acmr.storage.run_dir import RunDir
 from sweeps.display import print_plan
 from sweeps.estimate import estimate
-from sweeps.folder import RUNNING, WAITING
+from sweeps.folder import WAITING
 from sweeps.plan import Plan, expand, make_plan
 from sweeps.status import main
 from sweeps.sweeper import entries_of

@@ -13,7 +13,8 @@ from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
 from acmr.agent.replay_buffer import ReplayBuffer
-from acmr.storage.durable import DamagedError, FileDigest, read_marked, write_bytes
+from acmr.records import DamagedError
+from acmr.storage.durable import FileDigest, read_marked, write_bytes
 
 _NAME = re.compile(r"segment_(\d{1,15})_(\d{1,15})\.safetensors")
 #: Bytes that a segment takes beside its numbers.

@@ -17,8 +17,9 @@ import torch
 
 from acmr.config import ConfigError
 from acmr.evaluation.camera import without_gl
-from acmr.evaluation.evaluate import RESULT_FILE, evaluate, still
+from acmr.evaluation.evaluate import evaluate, still
 from acmr.evaluation.video import FILM_SUFFIXES
+from acmr.records import EVALUATION_FILE
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -59,7 +60,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         "--seconds", type=_seconds, metavar="S", help="of the film: S seconds of simulated time, episode after episode"
     )
     _add_size(parser)
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help=f"default: {RESULT_FILE} in the run directory")
+    parser.add_argument("--out", type=Path, metavar="FILE.json", help=f"default: RUN_DIR/{EVALUATION_FILE}")
     parser.set_defaults(action=evaluate)
     given = parser.parse_args(arguments)
     if given.seed < 0:

@@ -16,12 +16,12 @@ import numpy as np
 from acmr.config import ConfigError, EnvConfig
 from acmr.evaluation.camera import is_robot, make_camera
 from acmr.evaluation.rollout import Episode, VideoOptions, play, render_mode
+from acmr.records import CONFIG_FILE, EVALUATION_FILE
 from acmr.settings.compose import environment_config
 from acmr.storage.durable import write_bytes
 from acmr.storage.run_dir import RunDir
 from acmr.transfer.teacher import Teacher, load_teacher
 
-RESULT_FILE = "evaluation.json"
 #: Where a still is seen from, in degrees, and how close, relative to the camera that follows a robot.
 _STILL_AZIMUTH, _STILL_CLOSENESS = 150.0, 0.85
 
@@ -37,7 +37,7 @@ def load_run(path: Path) -> tuple[Teacher, EnvConfig]:
         raise ConfigError(f"{path}: no such run directory; give one as in runs/quick/ant-none/seed_1")
     settings = run_dir.stored_settings()
     if settings is None:
-        raise ConfigError(f"{path}: not a run directory (no config.yaml); give one as in runs/quick/ant-none/seed_1")
+        raise ConfigError(f"{path}: not a run directory (no {CONFIG_FILE}); give one as in runs/quick/ant-none/seed_1")
     if not run_dir.is_complete():
         raise ConfigError(f"{path}: this run is not finished; start it again with the command that began it")
     try:
@@ -62,7 +62,7 @@ def check_fit(teacher: Teacher, config: EnvConfig) -> str | None:
     if (list(here.observation_names), list(here.action_names)) != (about.observation_names, about.action_names):
         raise ConfigError(
             f"{teacher.path}: learned with {about.dims}, but {config.name} has {len(here.observation_names)} sensors "
-            f"and {len(here.action_names)} actuators here, or other ones; are config.yaml and the teacher of one run?"
+            f"and {len(here.action_names)} actuators here, or other ones; are {CONFIG_FILE} and the teacher of one run?"
         )
     if here.model_hash != about.model_hash:
         return f"{config.name} is not the robot it was trained on (another version of mujoco or gymnasium?)"
@@ -119,7 +119,7 @@ def evaluate(given: argparse.Namespace) -> None:
         f"mean {content['mean_return']:,.1f}  standard deviation {content['std_return']:,.1f}"
         f"{_velocity(content['mean_forward_velocity'])}  over {len(episodes)} episodes, {content['policy']} policy"
     )
-    path = given.out or given.run_dir / RESULT_FILE
+    path = given.out or given.run_dir / EVALUATION_FILE
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())

@@ -11,12 +11,13 @@ from typing import Any
 
 from acmr.config import INEXACT, ConfigError
 from acmr.envs.state import ANYTIME, NEVER
+from acmr.records import DamagedError
 from acmr.run.reproducibility import differences
 from acmr.run.run_state import RunState
 from acmr.run.stop_signals import Stopped, StopSignals
 from acmr.run.trainer import is_finite
 from acmr.storage.checkpoint_store import KEPT, SnapshotStore
-from acmr.storage.durable import DamagedError, FileDigest
+from acmr.storage.durable import FileDigest
 
 #: Steps between two checkpoints where none are set: a share of the run, within these bounds.
 _SHARE, _LEAST, _MOST = 20, 1_000, 25_000

@@ -8,15 +8,23 @@ from pathlib import Path
 
 from acmr.agent.sac import METRIC_NAMES
 from acmr.envs import EnvDescription
-from acmr.records import EPISODE_COLUMNS, VELOCITY_COLUMN, EpisodeRecord, meets_threshold
+from acmr.records import (
+    EPISODE_COLUMNS,
+    METRIC_COLUMNS,
+    STOPPED,
+    VELOCITY_COLUMN,
+    DamagedError,
+    EpisodeRecord,
+    meets_threshold,
+)
 from acmr.storage.csv_log import CsvLog
-from acmr.storage.durable import DamagedError, FileDigest
+from acmr.storage.durable import FileDigest
 from acmr.storage.run_dir import RunDir
 from acmr.tracking.progress import RunProgress
 from acmr.tracking.status_file import Heartbeat
 from acmr.tracking.wandb_tracker import Tracker
 
-_METRIC_COLUMNS = ("global_step", "steps_per_second", *METRIC_NAMES)
+_METRIC_COLUMNS = (*METRIC_COLUMNS, *METRIC_NAMES)
 
 
 class RunLogs:
@@ -140,6 +148,6 @@ class Recorder:
     def close(self, summary: Mapping[str, object] | None) -> None:
         """Ends everything; without a summary the run did not come to its end."""
         self._progress.close()
-        self._heartbeat.close(str(summary["status"]) if summary else "stopped")
+        self._heartbeat.close(str(summary["status"]) if summary else STOPPED)
         self._logs.close()
         self._tracker.finish(summary, 0 if summary else 1)

@@ -15,10 +15,11 @@ import torch
 
 from acmr.agent.replay_files import BufferFiles
 from acmr.envs.state import EnvState, capture, restore
+from acmr.records import DamagedError
 from acmr.run.run_logs import RunLogs
 from acmr.run.trainer import Trainer
 from acmr.storage.checkpoint_store import Snapshot
-from acmr.storage.durable import DamagedError, FileDigest
+from acmr.storage.durable import FileDigest
 
 #: What :class:`acmr.records.EpisodeInProgress` sums up.
 _EPISODE = ("length", "total", "distance", "sums")

@@ -21,8 +21,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
+from acmr.records import DamagedError
 from acmr.storage.durable import (
-    DamagedError,
     FileDigest,
     make_folder,
     read_marked,

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from acmr.config import ConfigError
+from acmr.records import DamagedError
 
 #: Called with an action and a file before each step; a test may raise OSError here, or end the process.
 hook: Callable[[str, Path], None] | None = None
@@ -53,10 +54,6 @@ class StorageError(ConfigError):
         remedy = _REMEDIES.get(error.errno or 0, "mend that")
         then = f"; it resumes at step {latest:,}" if latest else ""
         super().__init__(f"{run_dir}: {error}; {remedy}, then run the same command again{then}")
-
-
-class DamagedError(Exception):
-    """A file does not hold what was written to it. The message says which file and what is wrong."""
 
 
 @dataclass(frozen=True)

@@ -16,25 +16,30 @@ from typing import Any
 import yaml
 
 from acmr.config import ConfigError, ExperimentConfig, differing_keys
-from acmr.records import COMPLETE, DESCRIPTION_FILE, TENSOR_FILE
-from acmr.storage.durable import (
+from acmr.records import (
+    COMPLETE,
+    CONFIG_FILE,
+    DESCRIPTION_FILE,
+    EPISODES_FILE,
+    EVALUATION_FILE,
+    LOG_FILE,
+    METRICS_FILE,
+    SUMMARY_FILE,
+    TENSOR_FILE,
+    TRANSFER_FILE,
     DamagedError,
-    read_regular,
-    remove,
-    remove_leftovers,
-    sync_folder,
-    write_bytes,
 )
+from acmr.storage.durable import read_regular, remove, remove_leftovers, sync_folder, write_bytes
 
 #: Files that a run writes anew when it starts from the beginning; what would make it look finished goes first.
 _RESULTS = (
-    "summary.json",
-    "episodes.csv",
-    "metrics.csv",
-    "transfer.json",
+    SUMMARY_FILE,
+    EPISODES_FILE,
+    METRICS_FILE,
+    TRANSFER_FILE,
     TENSOR_FILE,
     DESCRIPTION_FILE,
-    "evaluation.json",
+    EVALUATION_FILE,
 )
 #: A settings file or a summary larger than this is not one of ours.
 _MAX_BYTES = 1 << 20
@@ -53,12 +58,12 @@ class RunDir:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.config_file = path / "config.yaml"
-        self.episodes_file = path / "episodes.csv"
-        self.metrics_file = path / "metrics.csv"
-        self.transfer_file = path / "transfer.json"
-        self.summary_file = path / "summary.json"
-        self.log_file = path / "run.log"
+        self.config_file = path / CONFIG_FILE
+        self.episodes_file = path / EPISODES_FILE
+        self.metrics_file = path / METRICS_FILE
+        self.transfer_file = path / TRANSFER_FILE
+        self.summary_file = path / SUMMARY_FILE
+        self.log_file = path / LOG_FILE
         self.lock_file = path / ".lock"
         self.checkpoint_folder = path / "checkpoint"
 

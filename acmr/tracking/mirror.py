@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 
 from acmr.config import ConfigError, TrackingConfig
+from acmr.records import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, SUMMARY_FILE
 from acmr.tracking.wandb_backend import linked_mirrors, server_problem, wandb_environment
 from acmr.tracking.wandb_tracker import Tracker, labels, make_tracker
 
@@ -35,7 +36,7 @@ def replay(tracker: Tracker, run_dir: Path, until_step: int | None = None) -> No
         until_step: The last global step to mirror; None: all.
     """
     # An episode that ends at a step comes before that step's metrics, as in the run itself.
-    for step, row in merge(_rows(run_dir / "episodes.csv"), _rows(run_dir / "metrics.csv"), key=lambda item: item[0]):
+    for step, row in merge(_rows(run_dir / EPISODES_FILE), _rows(run_dir / METRICS_FILE), key=lambda item: item[0]):
         if until_step is not None and step > until_step:
             break
         tracker.metrics(step, row)
@@ -53,7 +54,7 @@ def rebuild(run_dir: Path, warn: Callable[[str], None]) -> None:
     """
     run_dir = run_dir.resolve()
     try:
-        settings: dict[str, Any] = yaml.safe_load((run_dir / "config.yaml").read_text())
+        settings: dict[str, Any] = yaml.safe_load((run_dir / CONFIG_FILE).read_text())
         tracking = {**settings["tracking"], "mode": "offline", "base_url": None}
         summary = _summary(run_dir)
         run_name = run_dir.parent.name
@@ -176,7 +177,7 @@ def _rows(file: Path) -> Iterator[Row]:
 
 
 def _summary(run_dir: Path) -> dict[str, Any] | None:
-    file = run_dir / "summary.json"
+    file = run_dir / SUMMARY_FILE
     return json.loads(file.read_text()) if file.exists() else None
 
 

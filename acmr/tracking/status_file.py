@@ -13,10 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-STATUS_FILE = "status.json"
+from acmr.records import RUNNING, STATUS_FILE
+
 #: Seconds between two writings, and steps between two looks at the clock.
 INTERVAL, STRIDE = 2.0, 16
-RUNNING = "running"
 
 
 class Heartbeat:

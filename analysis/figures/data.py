@@ -11,8 +11,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from acmr.records import CELLS, VELOCITY_COLUMN
+from acmr.records import CELLS, COMPLETE, VELOCITY_COLUMN
 from analysis.figures.style import Palette
+from analysis.loading.read_run import FOREIGN, UNFINISHED
 from analysis.loading.speed import read_speed
 from analysis.statistics.metrics import rolling_mean
 
@@ -93,7 +94,7 @@ def drawn_runs(runs: pd.DataFrame, group: str) -> pd.DataFrame:
     """See :meth:`FigureData.drawn`."""
     own = runs[(runs["group"] == group) & (runs["episodes"] > 0)]
     counted = own[own["counted"]]
-    return counted if len(counted) else own[own["state"] == "unfinished"]
+    return counted if len(counted) else own[own["state"] == UNFINISHED]
 
 
 def default_window(runs: pd.DataFrame) -> int:
@@ -128,7 +129,7 @@ def learning_curves(runs: pd.DataFrame, episodes: pd.DataFrame, groups: list[str
         for name, run in drawn_runs(runs, group).iterrows():
             own = by_run[str(name)]
             steps = own["global_step"].to_numpy(dtype=float)
-            end = run["horizon"] if run["state"] in ("complete", "foreign") else run["last_step"]
+            end = run["horizon"] if run["state"] in (COMPLETE, FOREIGN) else run["last_step"]
             table = {key: _resample(steps, rolling_mean(own[key], window), grid, end) for key in QUANTITIES}
             parts.append(pd.DataFrame({"group": group, "seed": int(run["seed"]), "step": grid, **table}))
     columns = ["group", "seed", "step", *QUANTITIES]

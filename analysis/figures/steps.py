@@ -12,6 +12,7 @@ from acmr.records import CELLS, VELOCITY_COLUMN
 from analysis.figures.data import MOST_OTHERS, FigureData, FigureSpec, mean_curve
 from analysis.figures.parts import count_label, finish, marker_style, stacked, step_axis, two_lines
 from analysis.figures.style import COLUMN, Palette
+from analysis.loading.read_run import UNFINISHED
 from analysis.statistics.survival import kaplan_meier
 
 
@@ -22,7 +23,7 @@ def kaplan_meier_curves(data: FigureData, palette: Palette) -> Figure | None:
         for group in groups:
             # Unfinished runs are what censoring is made for: they were watched until their last episode.
             own = data.runs[(data.runs["group"] == group) & (data.runs["episodes"] > 0)]
-            own = own[own["counted"] | (own["state"] == "unfinished")]
+            own = own[own["counted"] | (own["state"] == UNFINISHED)]
             curve = kaplan_meier(own["time"], ~own["censored"].astype(bool))
             color = palette.color(group, data.groups)
             end = max(float(own["time"].max()), curve.steps[-1])

@@ -12,14 +12,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from acmr.records import EPISODE_COLUMNS, VELOCITY_COLUMN
+from acmr.records import EPISODE_COLUMNS, EPISODES_FILE, VELOCITY_COLUMN, DamagedError
 
 #: What a run's episodes may lie in; the first that is there is read.
-EPISODE_FILES = ("episodes.csv", "episodes.csv.gz")
-
-
-class DamagedError(ValueError):
-    """A file that cannot be taken as a run's record. Its message is the reason, in one line."""
+EPISODE_FILES = (EPISODES_FILE, f"{EPISODES_FILE}.gz")
 
 
 def read_episodes(path: Path) -> tuple[pd.DataFrame, list[str]]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.records import CELLS
+from acmr.records import CELLS, SEED_FOLDER
 
 #: (source, target) environments of the profiles, for runs of which only the directory's name is left.
 PAIRS = (
@@ -16,7 +15,6 @@ PAIRS = (
     ("humanoid_v5", "armless_humanoid_v5"),
     ("ant", "ant_three_legs"),
 )
-SEED = re.compile(r"seed_(\d+)")
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ def identify(directory: Path, name: str, config: Mapping[str, Any], summary: Map
         cell = _cell_of(config, name)
     else:
         cell = dict(_names()).get(name) or (name.upper() if name.upper() in CELLS else None)
-    match = SEED.fullmatch(directory.name)
+    match = SEED_FOLDER.fullmatch(directory.name)
     seed = summary.get("seed", config.get("seed", int(match.group(1)) if match else None))
     return Identity(
         group=cell or name,

@@ -8,6 +8,7 @@ import pandas as pd
 
 from acmr.records import CELLS
 from analysis.loading.load import RunSet
+from analysis.loading.read_run import DAMAGED
 
 #: The paper's seeds (section 4.2).
 PAPER_SEEDS = (1, 2, 3)
@@ -47,7 +48,7 @@ def missing_runs(data: RunSet) -> list[Missing]:
             there = runs[(runs["cell"] == cell) & (runs["seed"] == seed)]
             if not there["counted"].any():
                 state = str(there["state"].iloc[0]) if len(there) else "missing"
-                force = " force=true" if state == "damaged" else ""
+                force = " force=true" if state == DAMAGED else ""
                 found.append(Missing(cell, seed, state, f"python run.py experiment={cell} seed={seed}{option}{force}"))
     return found
 

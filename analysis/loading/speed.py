@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from acmr.records import METRIC_COLUMNS, METRICS_FILE
+
 #: What a run's metrics may lie in; the first that is there is read.
-METRICS_FILES = ("metrics.csv", "metrics.csv.gz")
+METRICS_FILES = (METRICS_FILE, f"{METRICS_FILE}.gz")
 #: Points that a run's curve has at most.
 POINTS = 250
 
@@ -29,7 +31,7 @@ def read_speed(directory: Path, start: float = 0.0) -> pd.DataFrame:
     if path is None:
         return empty
     try:
-        table = pd.read_csv(path, usecols=["global_step", "steps_per_second"], on_bad_lines="skip")
+        table = pd.read_csv(path, usecols=list(METRIC_COLUMNS), on_bad_lines="skip")
         table = table.apply(pd.to_numeric, errors="coerce").dropna().astype(float)
     except (OSError, ValueError):
         return empty

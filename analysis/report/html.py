@@ -12,6 +12,7 @@ from typing import Any
 import jinja2
 import pandas as pd
 
+from acmr.records import CONFIG_FILE, LOG_FILE, SUMMARY_FILE
 from analysis.loading.episodes import EPISODE_FILES
 from analysis.loading.load import RunSet
 from analysis.loading.missing import Missing
@@ -20,7 +21,7 @@ from analysis.report.published import published_table3
 from analysis.report.tables import heading, readable
 
 #: Files of a run that are linked where they are there.
-RUN_FILES = (*EPISODE_FILES, *METRICS_FILES, "config.yaml", "summary.json", "run.log")
+RUN_FILES = (*EPISODE_FILES, *METRICS_FILES, CONFIG_FILE, SUMMARY_FILE, LOG_FILE)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
+from acmr.records import CONFIG_FILE, SUMMARY_FILE
 from analysis.statistics.comparisons import FAMILY, LARGE_EFFECT
 from analysis.statistics.two_samples import ALPHA, detectable_effect, power, smallest_permutation_p
 
@@ -72,8 +73,8 @@ def how_runs_count(consecutive: int) -> list[str]:
         "Where some runs of a cell never reached the threshold, its mean is of the others, and no t-test is made, "
         "because dropping the slowest runs flatters a cell. Restricted means (steps within the horizon) and the "
         "log-rank test keep every run; both p-values come from permutations.",
-        "Runs without config.yaml and summary.json (foreign) are taken as complete. Damaged and duplicate runs are "
-        "listed and not used.",
+        f"Runs without {CONFIG_FILE} and {SUMMARY_FILE} (foreign) are taken as complete. Damaged and duplicate runs "
+        "are listed and not used.",
     ]
 
 

@@ -6,6 +6,7 @@ import hashlib
 import os
 from pathlib import Path
 
+from acmr.records import STATUS_FILE
 from analysis.loading.load import RunSet
 from analysis.report.html import RUN_FILES
 
@@ -25,7 +26,7 @@ def fingerprint(data: RunSet, out: Path, settings: dict[str, object]) -> str:
     digest.update(os.path.relpath(data.root.resolve(), out.resolve()).encode())
     package = Path(__file__).parent.parent
     sources = sorted(path for path in package.rglob("*") if path.suffix in (".py", ".html", ".css", ".js", ".csv"))
-    runs = [data.root / str(run) / name for run in data.runs.index for name in (*RUN_FILES, "status.json")]
+    runs = [data.root / str(run) / name for run in data.runs.index for name in (*RUN_FILES, STATUS_FILE)]
     for path, base in [*((path, package) for path in sources), *((path, data.root) for path in runs)]:
         if path.is_file():
             content = hashlib.sha256(path.read_bytes()).hexdigest()

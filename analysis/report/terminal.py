@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from analysis.loading.missing import Missing
+from analysis.loading.read_run import UNFINISHED
 
 #: Missing runs named one by one; more are only counted.
 MOST_NAMED = 6
@@ -62,7 +63,7 @@ def missing_lines(missing: Sequence[Missing], planned: int, command: str) -> lis
 
 def left_out_lines(runs: pd.DataFrame) -> list[str]:
     """Runs that were found but do not count, with the reason."""
-    odd = runs[~runs["counted"] & (runs["state"] != "unfinished")]
+    odd = runs[~runs["counted"] & (runs["state"] != UNFINISHED)]
     return [f"not used: {name} ({run['state']}): {run['reason']}" for name, run in odd.iterrows()]
 
 

@@ -1,0 +1,174 @@
+"""One run's directory -> its row, its episodes, its settings; or the reason why it cannot be used."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from acmr.records import (
+    COMPLETE,
+    CONFIG_FILE,
+    DIVERGED,
+    EPISODE_COLUMNS,
+    EPISODES_FILE,
+    STATUS_FILE,
+    SUMMARY_FILE,
+    VELOCITY_COLUMN,
+    DamagedError,
+)
+from analysis.loading.episodes import EPISODE_FILES, read_episodes
+from analysis.loading.identify import Identity, identify
+
+#: States of a run that is there, beside those that it says itself.
+FOREIGN, UNFINISHED, DAMAGED, DUPLICATE = "foreign", "unfinished", "damaged", "duplicate"
+
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@dataclass(frozen=True)
+class FoundRun:
+    """What lies in one directory.
+
+    Attributes:
+        row: What is known of the run, by the columns of :attr:`analysis.loading.load.RunSet.runs`.
+        episodes: Its episodes, empty if they cannot be read.
+        config: Its settings, empty if there are none.
+        summary: Its summary, empty if there is none.
+    """
+
+    row: dict[str, Any]
+    episodes: pd.DataFrame
+    config: dict[str, Any]
+    summary: dict[str, Any]
+
+
+def read_run(root: Path, directory: Path, problem: str = "") -> FoundRun:
+    """Reads one run; whatever is wrong with it becomes its state and reason.
+
+    Args:
+        root: The runs folder.
+        directory: The run's.
+        problem: Why the directory cannot be looked into.
+    """
+    notes = [problem] if problem else []
+    damaged = bool(problem)
+    config, summary, frame = {}, {}, no_episodes()
+    try:
+        config = _mapping_of(directory / CONFIG_FILE)
+        summary = _mapping_of(directory / SUMMARY_FILE)
+        path = next((directory / name for name in EPISODE_FILES if (directory / name).is_file()), None)
+        if path is not None:
+            frame, said = read_episodes(path)
+            notes += said
+        elif not problem:
+            notes.append(f"no {EPISODES_FILE}")
+    except DamagedError as error:
+        notes.append(str(error))
+        damaged = True
+    name = directory.relative_to(root).as_posix()
+    parent = Path(name).parent.as_posix() if directory != root else directory.resolve().parent.name
+    identity = identify(directory, parent if parent != "." else root.resolve().name, config, summary)
+    state, reasons = (DAMAGED, []) if damaged else _state(directory, identity, frame, config, summary, notes)
+    row = {"run": name, **vars(identity), "state": state, "reason": "; ".join([*notes, *reasons])}
+    return FoundRun(row | _measures(state, frame, config, summary), frame, config, summary)
+
+
+def _mapping_of(path: Path) -> dict[str, Any]:
+    """Contents of a YAML or JSON file; empty if there is no such file."""
+    if not path.is_file():
+        return {}
+    try:
+        text = path.read_text(encoding="utf-8")
+        value = json.loads(text) if path.suffix == ".json" else _yaml(text)
+    except (OSError, ValueError, yaml.YAMLError, RecursionError):
+        raise DamagedError(f"{path.name}: cannot be read") from None
+    if not isinstance(value, dict):
+        raise DamagedError(f"{path.name}: holds no settings")
+    return value
+
+
+def _yaml(text: str) -> Any:
+    # No run writes aliases; in a foreign file they can hold a mapping within itself, or a billion of them.
+    if "*" in text and any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, _LOADER)):
+        raise ValueError("aliases")
+    return yaml.load(text, _LOADER)
+
+
+def _state(
+    directory: Path,
+    identity: Identity,
+    frame: pd.DataFrame,
+    config: dict[str, Any],
+    summary: dict[str, Any],
+    notes: list[str],
+) -> tuple[str, list[str]]:
+    if identity.seed is None:
+        return DAMAGED, ["its seed is not known: call its folder seed_<n>"]
+    if summary:
+        return _ended_state(frame, summary, notes)
+    if not config and len(frame):
+        return FOREIGN, [f"no {CONFIG_FILE} and no {SUMMARY_FILE}: taken as complete"]
+    return UNFINISHED, [_unfinished(directory)]
+
+
+def _ended_state(frame: pd.DataFrame, summary: dict[str, Any], notes: list[str]) -> tuple[str, list[str]]:
+    count = summary.get("episodes")
+    if isinstance(count, int) and count != len(frame):
+        return DAMAGED, [f"{SUMMARY_FILE} counts {count} episodes, {EPISODES_FILE} {len(frame)}"]
+    if count is None and notes and not len(frame):
+        return DAMAGED, []
+    reasons = []
+    if summary.get("cause"):
+        reasons.append(f"at step {summary.get('step', '?')}: {summary['cause']}")
+    if summary.get("inexact_resumes"):
+        reasons.append(f"resumed inexactly: {json.dumps(summary['inexact_resumes'])}")
+    if summary.get("physics_warnings"):
+        reasons.append(f"warnings of MuJoCo: {json.dumps(summary['physics_warnings'])}")
+    return str(summary.get("status", COMPLETE)), reasons
+
+
+def _unfinished(directory: Path) -> str:
+    try:
+        said = _mapping_of(directory / STATUS_FILE)
+        return f"no {SUMMARY_FILE}; {said['state']} at step {said['global_step']:,} of {said['total_timesteps']:,}"
+    except (DamagedError, LookupError, TypeError, ValueError):
+        return f"no {SUMMARY_FILE}"
+
+
+def _measures(
+    state: str, frame: pd.DataFrame, config: dict[str, Any], summary: dict[str, Any]
+) -> dict[str, float | int | None]:
+    last = int(frame["global_step"].iloc[-1]) if len(frame) else 0
+    total = _number(summary.get("total_timesteps", config.get("total_timesteps")))
+    reached = _number(summary.get("global_step"))
+    # What a run that diverged would have returned afterwards is known: nothing. It did not reach in all its time.
+    ends = {COMPLETE: (reached, total), DIVERGED: (total, reached)}.get(state, ())
+    agent = config.get("agent")
+    starts = agent.get("learning_starts") if isinstance(agent, dict) else None
+    return {
+        "episodes": len(frame),
+        "last_step": last,
+        "horizon": max(last, int(next((end for end in ends if end is not None), last))),
+        "total_timesteps": total,
+        "learning_starts": _number(starts),
+        "threshold": _number(summary.get("threshold", config.get("threshold"))),
+        "consecutive": _number(summary.get("consecutive", config.get("consecutive"))),
+        "wall_seconds": _number(summary.get("wall_seconds")),
+        "steps_per_second": _number(summary.get("steps_per_second")),
+        "steps_in_summary": _number(summary.get("steps_to_threshold")),
+    }
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def no_episodes() -> pd.DataFrame:
+    """The frame of episodes without any."""
+    columns = dict.fromkeys(EPISODE_COLUMNS, "int64") | {"episodic_return": "float64", VELOCITY_COLUMN: "float64"}
+    return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in columns.items()})
