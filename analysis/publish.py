@@ -26,6 +26,7 @@ from acmr.records import (
     TENSOR_FILE,
     TRANSFER_FILE,
 )
+from acmr.text import size
 
 #: A file above this is compressed.
 LARGE = 1_000_000
@@ -104,8 +105,7 @@ def _write(path: Path, data: bytes) -> None:
 
 def _report(added: list[Path], there: list[Path]) -> Iterator[str]:
     for run in added:
-        size = sum(path.stat().st_size for path in run.iterdir())
-        yield f"added    {run} ({size / 1e6:.1f} MB)"
+        yield f"added    {run} ({size(sum(path.stat().st_size for path in run.iterdir()))})"
     for run in there:
         yield f"is there {run}"
 

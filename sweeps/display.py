@@ -13,16 +13,16 @@ from rich.live import Live
 from rich.text import Text
 
 from acmr.records import COMPLETE, DIVERGED, ENDED, RUNNING, STOPPED
+from acmr.text import duration, size
 from sweeps.estimate import Estimate
-from sweeps.folder import FAILED, FINAL, WAITING, SweepFolder, SweepRun
+from sweeps.folder import FAILED, FINAL, OUTPUT_FILE, WAITING, SweepFolder, SweepRun
 from sweeps.plan import Plan, PlannedRun
-from sweeps.view import BLOCKED, LOST, RunStatus, counts, span, steps_ahead, table, view_entries
+from sweeps.view import BLOCKED, LOST, RunStatus, counts, steps_ahead, table, view_entries
 
 #: Seconds between two plain lines on how far everything is.
 LINE_INTERVAL = 60.0
 #: Seconds after which the average speed since the start says more than the present one.
 _SETTLED = 30.0
-OUTPUT_FILE = "output.log"
 
 
 class Display:
@@ -91,7 +91,7 @@ class Display:
         """How far the whole is."""
         speed = self._speed()
         ahead = steps_ahead(self.views)
-        eta = f"; {speed:,.0f} steps/s, {span(ahead / speed)} left" if speed and ahead else ""
+        eta = f"; {speed:,.0f} steps/s, {duration(ahead / speed)} left" if speed and ahead else ""
         return f"{counts(self.views)}{eta}"
 
     def closing_table(self) -> int:
@@ -159,7 +159,7 @@ def print_plan(plan: Plan, needs: Estimate, workers: int, output_dir: Path) -> N
     if not plan.missing:
         return
     source = f"as fast as {_number(needs.measured_on)} that ended in {output_dir}"
-    time_needed = f"about {span(needs.seconds)}, {source}" if needs.seconds else "not known until a run is complete"
+    time_needed = f"about {duration(needs.seconds)}, {source}" if needs.seconds else "not known until a run is complete"
     console.print(f"workers: {workers}")
     console.print(f"time: {time_needed}", soft_wrap=True)
     if needs.stops_like is not None:
@@ -179,7 +179,5 @@ def _number(count: int) -> str:
     return f"{count} run{'' if count == 1 else 's'}"
 
 
-def _bytes(size: float | None) -> str:
-    if size is None:
-        return "an amount not known"
-    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"
+def _bytes(count: float | None) -> str:
+    return "an amount not known" if count is None else size(count)

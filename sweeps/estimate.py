@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from typing import Any
 from acmr.config import THRESHOLD, ExperimentConfig
 from acmr.envs import describe
 from acmr.records import COMPLETE, RUN_PATTERN, SUMMARY_FILE
+from acmr.storage.json_files import read_json
 from sweeps.plan import Plan, PlannedRun
 from sweeps.view import Lengths, full_name
 
@@ -76,10 +75,9 @@ def _finished(output_dir: Path) -> dict[Path, dict[str, Any]]:
     """Summaries of complete runs, by directory."""
     found: dict[Path, dict[str, Any]] = {}
     for path in output_dir.glob(f"{RUN_PATTERN}/{SUMMARY_FILE}"):
-        with suppress(OSError, ValueError):
-            summary = json.loads(path.read_text(encoding="utf-8"))
-            if summary.get("status") == COMPLETE:
-                found[path.parent] = summary
+        summary = read_json(path)
+        if summary is not None and summary.get("status") == COMPLETE:
+            found[path.parent] = summary
     return found
 
 

@@ -18,8 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from acmr.records import ENDED
+from acmr.storage.json_files import replace_json
 
 SWEEPS = ".sweeps"
+#: What a training printed, in its run's directory.
+OUTPUT_FILE = "output.log"
 #: States of a run of a sweep, beside those that it says itself.
 WAITING, FAILED = "waiting", "failed"
 #: States that a run does not leave within its sweep.
@@ -109,7 +112,7 @@ class SweepFolder:
             "order": list(order),
             "runs": [asdict(entry) for entry in entries],
         }
-        _write(folder.path / "plan.json", content)
+        replace_json(folder.path / "plan.json", content)
         for old in all_folders(output_dir)[:-_KEPT]:
             if not old.is_alive():
                 shutil.rmtree(old.path, ignore_errors=True)
@@ -153,7 +156,7 @@ class SweepFolder:
 
     def set_state(self, index: int, state: State) -> None:
         """Notes what has become of a run."""
-        _write(self._state_file(index), asdict(state))
+        replace_json(self._state_file(index), asdict(state))
 
     def _state_file(self, index: int) -> Path:
         return self.path / "states" / f"{index:05d}.json"
@@ -196,20 +199,3 @@ def _locked(path: Path) -> Iterator[bool]:
         yield False
     finally:
         os.close(descriptor)
-
-
-def is_alive(process: int) -> bool:
-    """Whether there is such a process on this machine."""
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def _write(path: Path, content: Mapping[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(content) + "\n", encoding="utf-8")
-    os.replace(temporary, path)

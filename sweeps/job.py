@@ -21,6 +21,7 @@ from acmr.config import ExperimentConfig
 from acmr.records import CONFIG_FILE
 from acmr.settings import compose
 from acmr.settings.run_spec import RunSpec
+from acmr.storage.json_files import replace_json
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 #: Environment variable with the process that a training must not outlive.
@@ -36,7 +37,7 @@ _SET_DEATH_SIGNAL = 1
 def write_job(path: Path, spec: RunSpec) -> None:
     """Stores a run with everything that follows from its settings, so that it needs no settings file any more."""
     content = {"settings": spec.settings, "changes": spec.changes, "name": spec.name, "cell": spec.cell}
-    path.write_text(json.dumps(content) + "\n", encoding="utf-8")
+    replace_json(path, content)
 
 
 def read_job(path: Path) -> RunSpec:

@@ -11,8 +11,9 @@ from pathlib import Path
 from rich.console import Console
 
 from acmr.records import CONFIG_FILE, RUN_PATTERN, RUNNING, SEED_FOLDER, STATUS_FILE
+from acmr.text import duration
 from sweeps.folder import FAILED, WAITING, State, SweepFolder, SweepRun, all_folders
-from sweeps.view import BLOCKED, LOST, RunStatus, counts, span, steps_ahead, table, view_entries, view_run
+from sweeps.view import BLOCKED, LOST, RunStatus, counts, steps_ahead, table, view_entries, view_run
 
 #: States for which somebody has to do something.
 _BAD = (FAILED, LOST, BLOCKED)
@@ -78,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say(console, line, color)
     running = [view for view in views if view.state == RUNNING]
     speed = sum(view.speed for view in running)
-    eta = f"; {speed:,.0f} steps/s, {span(steps_ahead(views) / speed)} left" if speed else ""
+    eta = f"; {speed:,.0f} steps/s, {duration(steps_ahead(views) / speed)} left" if speed else ""
     _say(console, f"{len(views)} runs: {counts(views)}{eta}")
     return 1 if any(view.state in _BAD for view in views) else 0
 

@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from acmr.config import ConfigError
 from acmr.records import COMPLETE, RUNNING, STOPPED
 from acmr.settings.compose import CONFIG_FOLDER
+from acmr.text import one_line
 from sweeps.display import Display, print_plan
 from sweeps.engine import LauncherAdapter, make_engine
 from sweeps.estimate import estimate
@@ -145,12 +146,13 @@ class Sweep:
             if self._signal is not None:
                 return
             if launch.error is not None:
-                board.say(f"jobs were lost ({_line(launch.error)}); what they were training is taken up again")
+                board.say(f"jobs were lost ({one_line(launch.error)}); what they were training is taken up again")
             self._settle()
             number += 1
             fruitless = fruitless + 1 if before == [self._state(index) for index in runs] else 0
             if fruitless > self._settings.retries:
-                board.say(f"error: the launcher starts no jobs; {_line(launch.error)}")
+                why = f" ({one_line(launch.error)})" if launch.error else ""
+                board.say(f"error: the launcher starts no jobs{why}")
                 return
 
     def _await(self, launch: Launch, board: Display) -> None:
@@ -251,11 +253,6 @@ def _refuse_overlap(plan: Plan, output_dir: Path) -> None:
                 f"{output_dir / common[0].directory}: process {process} has it in its sweep; "
                 f"wait for that, or end it: kill {process}"
             )
-
-
-def _line(error: BaseException | None) -> str:
-    text = str(error).strip().splitlines() if error is not None else []
-    return f"{type(error).__name__}: {text[0]}" if text else type(error).__name__
 
 
 def _places(plan: Plan) -> str:

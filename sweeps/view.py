@@ -5,8 +5,6 @@ Imports nothing heavy.
 
 from __future__ import annotations
 
-import json
-import os
 import re
 import statistics
 import time
@@ -16,8 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from acmr.records import COMPLETE, DIVERGED, ENDED, RUNNING, STOPPED, SUMMARY_FILE
+from acmr.storage.json_files import read_json
+from acmr.storage.processes import is_alive
+from acmr.text import duration
 from acmr.tracking.status_file import read_status
-from sweeps.folder import FAILED, FINAL, WAITING, State, SweepRun, is_alive
+from sweeps.folder import FAILED, FINAL, WAITING, State, SweepRun
 
 #: A run that says it is running, but whose process is gone or has said nothing for so many seconds.
 LOST, SILENCE = "lost", 600.0
@@ -73,7 +74,7 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
         total: Steps that it takes, if that is known.
         state: What the sweep that it belongs to knows of it.
     """
-    summary = None if state and state.state == RUNNING else _summary(directory)
+    summary = None if state and state.state == RUNNING else read_json(directory / SUMMARY_FILE)
     if summary is not None and summary.get("status") in ENDED:
         step, speed = int(summary.get("global_step") or 0), float(summary.get("steps_per_second") or 0)
         state_now, met = summary["status"], summary.get("steps_to_threshold")
@@ -201,20 +202,6 @@ def steps_ahead(views: Sequence[RunStatus]) -> float:
     return sum(lengths.expect(view.directory, view.total, view.step) - view.step for view in ahead)
 
 
-def span(seconds: float | None) -> str:
-    """A time to read: ``8 s``, ``12:05``, ``3:07:09``, ``2 d 3 h``."""
-    if seconds is None:
-        return "-"
-    whole = max(0, round(seconds))
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours >= 48:
-        return f"{hours // 24} d {hours % 24} h"
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
-
-
 def _kind(directory: Path) -> tuple[str, str]:
     return directory.parts[-3], full_name(directory.parts[-2])
 
@@ -227,7 +214,7 @@ def _cells(view: RunStatus) -> list[str]:
         view.state,
         f"{view.step:,}{share}" if view.step else "-",
         f"{view.speed:,.0f}" if view.speed else "-",
-        f"{'<' if stops(view.directory.parts[-2]) and view.seconds_left else ''}{span(view.seconds_left)}",
+        f"{'<' if stops(view.directory.parts[-2]) and view.seconds_left else ''}{duration(view.seconds_left)}",
         f"{view.latest:,.0f}" if view.latest is not None else "-",
         view.reason,
     ]
@@ -245,17 +232,8 @@ def _told(status: dict[str, Any], state: State, alive: bool) -> tuple[str, str]:
 
 def _is_alive(status: dict[str, Any]) -> bool:
     recent = time.time() - float(status.get("updated") or 0) < SILENCE
-    here = status.get("host") == os.uname().nodename
-    return recent and (not here or is_alive(int(status.get("process") or 0)))
+    return recent and is_alive(int(status.get("process") or 0), str(status.get("host")))
 
 
 def _verb(state: str) -> str:
     return "cannot start" if state == BLOCKED else state
-
-
-def _summary(directory: Path) -> dict[str, Any] | None:
-    try:
-        content = json.loads((directory / SUMMARY_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return content if isinstance(content, dict) else None

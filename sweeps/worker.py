@@ -14,12 +14,11 @@ from omegaconf import DictConfig
 from acmr.config import ConfigError
 from acmr.records import COMPLETE, ENDED, RUNNING, STOPPED
 from acmr.storage.run_dir import RunDir
-from sweeps.folder import FAILED, FINAL, State, SweepFolder, SweepRun
+from sweeps.folder import FAILED, FINAL, OUTPUT_FILE, State, SweepFolder, SweepRun
 from sweeps.job import STOP_SIGNALS, TrainingProcess
 
 #: The run that a job takes up where it may choose.
 NEXT = "next"
-OUTPUT_FILE = "output.log"
 #: Exit codes of one training that mean something; see the manual of ``run.py``.
 REFUSED, NUMBERS_DIVERGED, HELD = 2, 3, 75
 #: Seconds to wait for a run's directory that another process holds; a killed one may still write its checkpoint.

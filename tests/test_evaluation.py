@@ -127,6 +127,15 @@ def test_what_cannot_be_evaluated_says_why(run: Path, what: str, said: str, caps
     assert not (run / "evaluation.json").exists()
 
 
+def test_a_result_that_cannot_be_written_says_where_else(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for out in (run, run / "config.yaml" / "e.json"):
+        assert main([str(run), "--episodes", "1", "--out", str(out)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("error: ")
+        assert str(out) in line
+        assert line.endswith("type --out FILE.json")
+
+
 def test_a_robot_that_has_changed_is_remarked_on(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     description = json.loads((run / "teacher.json").read_text())
     # As a run of another robot would have described itself, without the check of its own entries.

@@ -12,7 +12,7 @@ import pytest
 
 from acmr.config import ConfigError
 from acmr.records import EpisodeRecord
-from acmr.tracking.progress import BarProgress, LineProgress, RunProgress, duration, make_progress
+from acmr.tracking.progress import BarProgress, LineProgress, RunProgress, make_progress
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -209,10 +209,3 @@ def test_modes() -> None:
         assert type(progress) is kind
     with pytest.raises(ConfigError, match="progress=loud: must be one of auto, bar, lines, off"):
         make_progress("loud", total_timesteps=10, threshold=1.0)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.2, "0 s"), (59.4, "59 s"), (59.6, "1:00"), (725, "12:05"), (11229, "3:07:09")]
-)
-def test_duration(seconds: float, text: str) -> None:
-    assert duration(seconds) == text

@@ -19,6 +19,7 @@ from acmr.envs import describe, make_env
 from acmr.envs.construct import find_spec, gym_ids
 from acmr.envs.naming import part_names
 from acmr.envs.wrappers import near_matches
+from acmr.text import message
 
 LEAVES = Path(__file__).resolve().parents[2] / "conf" / "env"
 
@@ -118,7 +119,7 @@ def _load(name: str, folder: Path) -> dict[str, Any]:
     try:
         return dict(yaml.safe_load((folder / f"{name}.yaml").read_text(encoding="utf-8")) or {})
     except (OSError, ValueError, TypeError, yaml.YAMLError) as error:
-        raise ConfigError(f"conf/env/{name}.yaml cannot be read: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"conf/env/{name}.yaml cannot be read: {message(error)}") from error
 
 
 def _values(name: str, folder: Path) -> dict[str, Any]:

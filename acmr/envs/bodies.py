@@ -12,6 +12,7 @@ from gymnasium.spaces import Box
 
 from acmr.config import ConfigError
 from acmr.envs.naming import part_names
+from acmr.text import message
 
 
 def edited_model(path: str, remove: Sequence[str]) -> mujoco.MjModel:
@@ -91,7 +92,7 @@ def _compiled(spec: mujoco.MjSpec, given: str) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise ConfigError(f"{given}: MuJoCo cannot build this: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{given}: MuJoCo cannot build this: {message(error)}") from error
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -21,6 +21,7 @@ from gymnasium.spaces import Box
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs.bodies import without_bodies
 from acmr.envs.wrappers import near_matches
+from acmr.text import one_line
 
 #: What MuJoCo says of Gymnasium's own model files, of no use to who runs them.
 _MODEL_REMARK = r"compiler attribute .* is deprecated"
@@ -99,11 +100,6 @@ def cannot_run(config: EnvConfig, error: Exception) -> ConfigError:
     needed = config.remove_bodies and isinstance(error, LookupError)
     why = "its own code needs a part that is gone" if needed else "this environment cannot run"
     return ConfigError(f"{' '.join(given)}: {why}: {one_line(error)}")
-
-
-def one_line(error: BaseException) -> str:
-    """Type and message of an error, on one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 @contextlib.contextmanager

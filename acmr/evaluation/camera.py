@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from acmr.config import ConfigError
+from acmr.text import message
 
 #: What has to be installed on Debian and Ubuntu to draw without a screen.
 GL_PACKAGES = "libegl1 libgl1-mesa-dri"
@@ -99,7 +100,7 @@ class OwnCamera:
         try:
             picture = np.asarray(self._env.render())
         except Exception as error:
-            raise ConfigError(f"{name} cannot draw itself: {' '.join(str(error).split())}") from error
+            raise ConfigError(f"{name} cannot draw itself: {message(error)}") from error
         if picture.ndim != 3 or picture.shape[2] < 3:
             raise ConfigError(f"{name} draws no pictures")
         return picture[..., :3]
@@ -143,7 +144,7 @@ def open_gl(width: int, height: int) -> Any:
             return importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
         except Exception as error:
             # Each way of not finding a library has its own exception, AttributeError among them.
-            reasons.append(f"{backend}: {' '.join(str(error).split())[:120]}")
+            reasons.append(f"{backend}: {message(error)[:120]}")
     raise ConfigError(
         f"no OpenGL library to draw with ({'; '.join(reasons)}); install it with: apt-get install {GL_PACKAGES}, "
         "and leave MUJOCO_GL unset or set MUJOCO_GL=egl"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -18,7 +17,8 @@ from acmr.evaluation.camera import is_robot, make_camera
 from acmr.evaluation.rollout import Episode, VideoOptions, play, render_mode
 from acmr.records import CONFIG_FILE, EVALUATION_FILE
 from acmr.settings.compose import environment_config
-from acmr.storage.durable import write_bytes
+from acmr.storage.durable import WriteError
+from acmr.storage.json_files import write_json
 from acmr.storage.run_dir import RunDir
 from acmr.transfer.teacher import Teacher, load_teacher
 
@@ -122,7 +122,9 @@ def evaluate(given: argparse.Namespace) -> None:
     path = given.out or given.run_dir / EVALUATION_FILE
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
+        write_json(path, content)
+    except WriteError as error:
+        raise ConfigError(f"{error}; type --out FILE.json") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror}); type --out FILE.json") from error
     print(f"written: {path}")

@@ -16,6 +16,7 @@ from PIL import Image
 
 from acmr.config import ConfigError
 from acmr.evaluation.camera import Camera, is_robot, make_camera
+from acmr.text import message
 
 #: Files that a film can be, and the frames per second that it has at most: an environment with more of them is filmed
 #: at every n-th step. A GIF holds each frame whole, and has to fit into a page.
@@ -93,7 +94,7 @@ class Film:
         try:
             yield
         except (ConfigError, OSError) as error:
-            self._say(f"no video: {' '.join(str(error).split())}")
+            self._say(f"no video: {message(error)}")
             with suppress(OSError):
                 self._end()
 

@@ -20,6 +20,7 @@ from acmr.run.random_streams import RandomStreams, random_streams
 from acmr.settings.run_spec import RunSpec, teacher_spec
 from acmr.storage.checkpoint_store import KEPT
 from acmr.storage.run_dir import RunDir
+from acmr.text import size
 from acmr.transfer.methods import NONE, TransferReport, transfer
 from acmr.transfer.teacher import Teacher, load_teacher
 
@@ -133,7 +134,7 @@ def check_space(config: ExperimentConfig, networks: Networks, run_dir: Path, che
     free = shutil.disk_usage(place).free
     if needed > free + _held(checkpoint_folder):
         raise ConfigError(
-            f"{run_dir}: takes up to {_size(needed)} while it runs, but its disk has {_size(free)} free; free some, "
+            f"{run_dir}: takes up to {size(needed)} while it runs, but its disk has {size(free)} free; free some, "
             "type output_dir=FOLDER on another disk, or checkpoint_every=0 (it cannot be resumed then)"
         )
 
@@ -146,7 +147,3 @@ def _held(folder: Path) -> int:
             with suppress(FileNotFoundError):
                 total += path.lstat().st_size
     return total
-
-
-def _size(count: int) -> str:
-    return f"{count / 1e9:.1f} GB" if count >= 1e8 else f"{count / 1e6:.1f} MB"

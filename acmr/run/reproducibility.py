@@ -61,11 +61,8 @@ def differences(stored: Mapping[str, str], here: Mapping[str, str]) -> list[str]
 
 
 def _processor_flags() -> bytes:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.machine().encode()
-    flags = next((line.partition(":")[2] for line in lines if line.startswith(("flags", "Features"))), "")
+    said = _first_processor()
+    flags = said.get("flags") or said.get("Features") or platform.machine()
     return " ".join(sorted(flags.split())).encode()
 
 
@@ -151,12 +148,17 @@ def machine(threads: int, device: str) -> dict[str, str | int]:
 
 def _processor() -> str:
     """The processor's name; with family and model, where it has them, for hypervisors shorten the name."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    # Of several processors the first: its entries come last here.
-    said = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
+    said = _first_processor()
     name = said.get("model name") or platform.processor() or "unknown"
     kind = [f"{key.split()[-1]} {said[key]}" for key in ("cpu family", "model") if key in said]
     return f"{name} ({', '.join(kind)})" if kind else name
+
+
+def _first_processor() -> dict[str, str]:
+    """What Linux says of the first processor, by name; empty elsewhere."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return {}
+    # Reversed, so that the first processor's entries come last and stay.
+    return {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}

@@ -20,6 +20,7 @@ from acmr.run.run_logs import RunLogs
 from acmr.run.trainer import Trainer
 from acmr.storage.checkpoint_store import Snapshot
 from acmr.storage.durable import FileDigest
+from acmr.text import one_line
 
 #: What :class:`acmr.records.EpisodeInProgress` sums up.
 _EPISODE = ("length", "total", "distance", "sums")
@@ -88,7 +89,7 @@ class RunState:
         try:
             self._restore(snapshot.values, snapshot)
         except (KeyError, ValueError, TypeError, IndexError, AttributeError, RuntimeError, OverflowError) as error:
-            raise DamagedError(f"not the state of this run ({type(error).__name__}: {error})") from error
+            raise DamagedError(f"not the state of this run ({one_line(error)})") from error
 
     def _restore(self, values: dict[str, Any], snapshot: Snapshot) -> None:
         trainer, arrays = self.trainer, snapshot.arrays

@@ -30,6 +30,8 @@ from acmr.records import (
     DamagedError,
 )
 from acmr.storage.durable import read_regular, remove, remove_leftovers, sync_folder, write_bytes
+from acmr.storage.json_files import write_json
+from acmr.storage.processes import is_alive
 
 #: Files that a run writes anew when it starts from the beginning; what would make it look finished goes first.
 _RESULTS = (
@@ -113,7 +115,7 @@ class RunDir:
 
     def write_json(self, path: Path, content: Mapping[str, Any]) -> None:
         """Writes a JSON file whole or not at all."""
-        write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
+        write_json(path, content)
 
     @contextmanager
     def log(self, say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
@@ -211,17 +213,7 @@ def _holder(descriptor: int) -> str:
     while time.monotonic() < deadline:
         said = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
         match = re.match(r"process ([1-9]\d{0,8}) on (\S+) since", said)
-        if match and (match[2] != platform.node() or _is_alive(int(match[1]))):
+        if match and is_alive(int(match[1]), match[2]):
             return said
         time.sleep(0.02)
     return "another process"
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True

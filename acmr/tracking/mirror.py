@@ -20,6 +20,7 @@ import yaml
 
 from acmr.config import ConfigError, TrackingConfig
 from acmr.records import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, SUMMARY_FILE
+from acmr.text import one_line
 from acmr.tracking.wandb_backend import linked_mirrors, server_problem, wandb_environment
 from acmr.tracking.wandb_tracker import Tracker, labels, make_tracker
 
@@ -61,8 +62,9 @@ def rebuild(run_dir: Path, warn: Callable[[str], None]) -> None:
         words = labels(settings, run_name, summary.get("cell") if summary else None)
         profile, seed = str(settings["profile"]), int(settings["seed"])
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise ConfigError(f"{run_dir} is no run's directory ({reason}); give one as in {_example()}") from error
+        raise ConfigError(
+            f"{run_dir} is no run's directory ({one_line(error)}); give one as in {_example()}"
+        ) from error
     tracker = make_tracker(
         TrackingConfig(**tracking),
         output_dir=run_dir.parents[2],

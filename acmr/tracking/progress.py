@@ -16,6 +16,7 @@ from rich.text import Text
 
 from acmr.config import PROGRESS_MODES, ConfigError
 from acmr.records import EpisodeRecord
+from acmr.text import duration
 
 #: Seconds between two drawings of the bar, and between two lines.
 BAR_INTERVAL, LINE_INTERVAL = 0.5, 60.0
@@ -259,16 +260,6 @@ def make_progress(
     if mode == "lines":
         return LineProgress(total_timesteps, threshold, consecutive, title, start_step, say, stops=stops)
     return RunProgress(total_timesteps, threshold, consecutive, start_step, stops=stops)
-
-
-def duration(seconds: float) -> str:
-    """A time span to read: ``8 s``, ``12:05``, ``3:07:09``."""
-    whole = max(0, round(seconds))
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
 def _bar(share: float, width: int) -> str:

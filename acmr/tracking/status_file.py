@@ -5,7 +5,6 @@ It is no result and need not survive anything, so it is replaced without waiting
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import time
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from acmr.records import RUNNING, STATUS_FILE
+from acmr.storage.json_files import read_json, replace_json
 
 #: Seconds between two writings, and steps between two looks at the clock.
 INTERVAL, STRIDE = 2.0, 16
@@ -65,19 +65,11 @@ class Heartbeat:
             "started": round(self._started, 1),
             "updated": round(time.time(), 1),
         }
-        temporary = self._path.with_name(f".{STATUS_FILE}.tmp")
         # Where that fails nobody can look at it; that is no reason to stop a training.
         with suppress(OSError):
-            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-            with open(descriptor, "w", encoding="utf-8") as stream:
-                stream.write(json.dumps(content) + "\n")
-            os.replace(temporary, self._path)
+            replace_json(self._path, content)
 
 
 def read_status(folder: Path) -> dict[str, Any] | None:
     """What a run said last; None if it never did, or not readably."""
-    try:
-        content = json.loads((folder / STATUS_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return content if isinstance(content, dict) else None
+    return read_json(folder / STATUS_FILE)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acmr.config import TrackingConfig
+from acmr.text import one_line
 
 if TYPE_CHECKING:
     from wandb import Run
@@ -233,9 +234,3 @@ def _id_of(mirror: Path) -> str:
 
 def _holds(path: Path, name: str) -> bool:
     return (path / f"run-{name}.wandb").exists() or not any(path.glob("run-*.wandb"))
-
-
-def one_line(error: BaseException) -> str:
-    """An exception as one short line."""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text[:400]}" if text else type(error).__name__

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from acmr.config import THRESHOLD, TrackingConfig
 from acmr.records import CELLS, VELOCITY_COLUMN, EpisodeRecord
+from acmr.text import one_line
 from acmr.tracking import wandb_backend
-from acmr.tracking.wandb_backend import LONGEST, SERVER_WAIT, one_line
+from acmr.tracking.wandb_backend import LONGEST, SERVER_WAIT
 
 if TYPE_CHECKING:
     from wandb import Run

@@ -25,6 +25,7 @@ from acmr.agent.networks import Dimensions, Networks
 from acmr.config import ACTIVATIONS, ConfigError
 from acmr.records import DESCRIPTION_FILE, TENSOR_FILE
 from acmr.storage.durable import write_bytes
+from acmr.storage.json_files import write_json
 
 FORMAT_VERSION = 1
 #: Files larger than this, and layers wider, are none of ours.
@@ -124,7 +125,7 @@ def save_teacher(folder: Path, networks: Networks, description: TeacherDescripti
     content = asdict(description) | {"sha256": hashlib.sha256(data).hexdigest()}
     content["description_sha256"] = _description_sha256(content)
     write_bytes(folder / TENSOR_FILE, data)
-    write_bytes(folder / DESCRIPTION_FILE, (json.dumps(content, indent=2) + "\n").encode())
+    write_json(folder / DESCRIPTION_FILE, content)
 
 
 def locate_teacher(path: str | Path) -> Path:
