@@ -1,12 +1,11 @@
-"""The settings of one run: their types, and what makes them valid.
+"""The settings of one run: their types, and in which of them two runs differ.
 
-Values live in ``conf/``; this module gives them types and checks them once, before anything is created.
-Nothing here knows where a value came from (see :mod:`acmr.settings.compose` for that).
+Values live in ``conf/``; this module gives them types. Nothing here knows where a value came from
+(:mod:`acmr.settings.compose`) or which ones can be run (:mod:`acmr.settings.validate`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -77,10 +76,40 @@ class SACConfig:
 
 
 @dataclass
+class TransferRules:
+    """What a transfer method needs and allows, as its file in ``conf/transfer`` states it.
+
+    Facts of the method, not settings of a run: they are in no ``config.yaml`` and no name, and the command line cannot
+    change them. The defaults are those of a method that copies some layers of any teacher with the same widths.
+    """
+
+    #: Whether there is a teacher to take something from.
+    needs_teacher: bool = True
+    #: Whether teacher and student must have the same numbers of sensors and actuators.
+    same_body: bool = False
+    #: Whether teacher and student must have hidden layers of the same widths.
+    same_widths: bool = True
+    #: Whether something is left that learns when all that is copied is frozen.
+    freezable: bool = True
+    #: Hidden layers that the student needs at least.
+    min_hidden_layers: int = 1
+    #: Other methods, named to a user whom this one is refused.
+    instead: list[str] = field(default_factory=list)
+
+    @property
+    def or_instead(self) -> str:
+        """End of a refusal: ``, or type transfer=hidden or transfer=expand``; empty where no other method is named."""
+        others = " or ".join(f"transfer={name}" for name in self.instead)
+        return f", or type {others}" if others else ""
+
+
+@dataclass
 class TransferConfig:
     """What a student takes from its teacher."""
 
+    #: The method, a file in ``conf/transfer``; by default nothing is taken.
     name: str = "none"
+    rules: TransferRules = field(default_factory=TransferRules)
     #: Path of a teacher file or of a finished run; None: the run of the source environment with the same seed.
     teacher: str | None = None
     #: Activation between the new input adapter and the teacher's first layer (``expand`` only).
@@ -149,114 +178,6 @@ class ExperimentConfig:
         return self.total_timesteps if self.stop_after is None else self.stop_after
 
 
-def validate(config: ExperimentConfig) -> None:
-    """Refuses what cannot be run.
-
-    Args:
-        config: The typed settings.
-
-    Raises:
-        ConfigError: With one line that says what was given, what is allowed and what to type.
-    """
-    agent = config.agent
-    _at_least("seed", config.seed, 0)
-    for key in ("total_timesteps", "consecutive", "threads", "log_every"):
-        _at_least(key, getattr(config, key), 1)
-    for key in ("batch_size", "buffer_size", "policy_frequency", "target_network_frequency"):
-        _at_least(f"agent.{key}", getattr(agent, key), 1)
-    _at_least("agent.learning_starts", agent.learning_starts, 0)
-    if config.checkpoint_every is not None:
-        _at_least("checkpoint_every", config.checkpoint_every, 0)
-    if config.env.max_episode_steps is not None:
-        _at_least("env.max_episode_steps", config.env.max_episode_steps, 1)
-    for key in ("policy_lr", "q_lr", "alpha"):
-        _within(f"agent.{key}", getattr(agent, key), low=0.0, high=math.inf, low_open=True)
-    _within("agent.tau", agent.tau, low=0.0, high=1.0, low_open=True)
-    _within("agent.gamma", agent.gamma, low=0.0, high=1.0)
-    if not math.isfinite(config.threshold):
-        raise ConfigError(f"threshold={config.threshold}: a finite return is needed, as in threshold=4900")
-    if not agent.hidden_sizes or min(agent.hidden_sizes) < 1:
-        raise ConfigError(
-            f"agent.hidden_sizes={agent.hidden_sizes}: one or more widths of at least 1 are needed, "
-            "as in agent.hidden_sizes=[256,256]"
-        )
-    _one_of("agent.precision", agent.precision, PRECISIONS)
-    _one_of("progress", config.progress, PROGRESS_MODES)
-    _one_of("resume", config.resume, (EXACT, INEXACT))
-    _one_of("tracking.mode", config.tracking.mode, TRACKING_MODES)
-    _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
-    _check_transfer(config)
-    _check_stop(config)
-    if config.tracking.mode == "self_hosted" and not config.tracking.base_url:
-        raise ConfigError("tracking=self_hosted needs the server's address: tracking.base_url=http://HOST:PORT")
-
-
-def _check_stop(config: ExperimentConfig) -> None:
-    _one_of("stop", config.stop, (HORIZON, THRESHOLD))
-    after = config.stop_after
-    if after is None:
-        return
-    _at_least("stop_after", after, 1)
-    if config.stop != THRESHOLD:
-        raise ConfigError(
-            f"stop_after={after} stop={config.stop}: only a run that stops at its threshold may end before its last "
-            f"step; type stop=threshold stop_after={after}, or total_timesteps={after} for a shorter run"
-        )
-    # It would change nothing, and give one run two names.
-    if after >= config.total_timesteps:
-        raise ConfigError(
-            f"stop_after={after}: the run has ended by then (total_timesteps={config.total_timesteps}); "
-            "type less, or leave stop_after out"
-        )
-
-
-def _check_transfer(config: ExperimentConfig) -> None:
-    transfer = config.transfer
-    if transfer.name == "none":
-        if config.freeze:
-            raise ConfigError(
-                "transfer=none freeze=true: without a transfer there is nothing to freeze; "
-                "type transfer=hidden freeze=true or transfer=none freeze=false"
-            )
-        if transfer.teacher is not None:
-            raise ConfigError(
-                f"transfer=none transfer.teacher={transfer.teacher}: without a transfer no teacher is read; "
-                "type transfer=hidden or transfer=expand"
-            )
-        if transfer.copy_log_alpha:
-            raise ConfigError(
-                "transfer=none transfer.copy_log_alpha=true: without a transfer no temperature is copied; "
-                "type transfer=hidden or transfer=expand"
-            )
-    if transfer.name == "direct" and config.freeze:
-        raise ConfigError(
-            "transfer=direct freeze=true: every layer would be frozen and nothing could learn; "
-            "type transfer=direct freeze=false, or evaluate the teacher with python -m acmr.evaluation"
-        )
-    if transfer.name == "hidden" and len(config.agent.hidden_sizes) < 2:
-        raise ConfigError(
-            f"transfer=hidden agent.hidden_sizes={config.agent.hidden_sizes}: there is no layer between two hidden "
-            "layers to transfer; give two widths or more, or type transfer=expand"
-        )
-
-
-def _at_least(key: str, value: int, least: int) -> None:
-    if value < least:
-        raise ConfigError(f"{key}={value}: an integer of at least {least} is needed, as in {key}={max(least, 1)}")
-
-
-def _within(key: str, value: float, *, low: float, high: float, low_open: bool = False) -> None:
-    if not math.isfinite(value) or value < low or value > high or (low_open and value == low):
-        bracket = "(" if low_open else "["
-        upper = "inf)" if math.isinf(high) else f"{high:g}]"
-        raise ConfigError(f"{key}={value}: a number in {bracket}{low:g}, {upper} is needed")
-
-
-def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise ConfigError(f"{key}={value}: must be one of {', '.join(allowed)}")
-
-
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings as ``{"agent.q_lr": 0.001, ...}``; lists are values."""
     flat: dict[str, Any] = {}
@@ -268,9 +189,16 @@ def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def plain_settings(config: ExperimentConfig) -> dict[str, Any]:
+    """All settings as plain data, as ``config.yaml`` stores them: without the rules of the method, which are none."""
+    settings = asdict(config)
+    del settings["transfer"]["rules"]
+    return settings
+
+
 def schema_defaults() -> dict[str, Any]:
     """The value of every setting, as ``group.key``, where no file and no command line says anything."""
-    return flatten(asdict(ExperimentConfig()))
+    return flatten(plain_settings(ExperimentConfig()))
 
 
 def is_neutral(key: str) -> bool:
@@ -285,7 +213,7 @@ def differing_keys(stored: Mapping[str, Any], config: ExperimentConfig) -> list[
     to what was done before, and then orphans no run. One that only the stored run knows did something that cannot be
     done any more, so it counts as a difference, unless it was null: not set.
     """
-    before, now = schema_defaults() | flatten(stored), flatten(asdict(config))
+    before, now = schema_defaults() | flatten(stored), flatten(plain_settings(config))
     keys = sorted(set(before) | set(now))
     return [
         key

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO
 
@@ -36,14 +36,14 @@ _SET_DEATH_SIGNAL = 1
 
 def write_job(path: Path, spec: RunSpec) -> None:
     """Stores a run with everything that follows from its settings, so that it needs no settings file any more."""
-    content = {"settings": spec.settings, "changes": spec.changes, "name": spec.name, "cell": spec.cell}
+    content = {"config": asdict(spec.config), "changes": spec.changes, "name": spec.name, "cell": spec.cell}
     replace_json(path, content)
 
 
 def read_job(path: Path) -> RunSpec:
     """Reads what :func:`write_job` stored."""
     content = json.loads(path.read_text(encoding="utf-8"))
-    config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ExperimentConfig), content["settings"]))
+    config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ExperimentConfig), content["config"]))
     assert isinstance(config, ExperimentConfig)
     return RunSpec(config, content["changes"], content["name"], content["cell"])
 

@@ -148,15 +148,15 @@ def _full_runs(specs: Sequence[RunSpec]) -> dict[Path, RunSpec]:
     full = {
         spec.directory: specify(replace(spec.config, stop=HORIZON, stop_after=None))
         for spec in specs
-        if spec.config.stop == THRESHOLD and spec.config.transfer.name == "none"
+        if spec.config.stop == THRESHOLD and not spec.config.transfer.rules.needs_teacher
     }
-    students = [spec for spec in specs if full and spec.config.transfer.name != "none"]
+    students = [spec for spec in specs if full and spec.config.transfer.rules.needs_teacher]
     teaching = {teacher_spec(spec.config).directory for spec in students if spec.config.transfer.teacher is None}
     return {directory: spec for directory, spec in full.items() if spec.directory in teaching}
 
 
 def _teacher(config: ExperimentConfig) -> RunSpec | None:
-    if config.transfer.name == "none":
+    if not config.transfer.rules.needs_teacher:
         return None
     if config.transfer.teacher is not None:
         if not Path(config.transfer.teacher).exists():

@@ -4,7 +4,6 @@ import itertools
 import math
 import re
 from copy import deepcopy
-from dataclasses import asdict
 from functools import reduce
 from operator import getitem
 
@@ -13,7 +12,15 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acmr.config import NEUTRAL_KEYS, ExperimentConfig, SACConfig, differing_keys, flatten, schema_defaults
+from acmr.config import (
+    NEUTRAL_KEYS,
+    ExperimentConfig,
+    SACConfig,
+    differing_keys,
+    flatten,
+    plain_settings,
+    schema_defaults,
+)
 from acmr.records import CELLS
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.errors import USER_ERRORS, check_booleans, explain
@@ -93,10 +100,13 @@ def test_python_defaults_say_what_the_paper_profile_says():
         (["agent.precision=half"], "agent.precision=half: must be one of float32, bfloat16"),
         (["env=humanoyd"], "did you mean env=humanoid?"),
         (["experiment=A9"], "must be one of A0, A1, A2, A3, A4, H0, H1"),
-        (["transfer=none", "freeze=true"], "type transfer=hidden freeze=true or transfer=none freeze=false"),
+        (["transfer=none", "freeze=true"], "type freeze=false, or type transfer=hidden or transfer=expand"),
         (["transfer=direct", "freeze=true"], "nothing could learn"),
-        (["transfer.teacher=runs/x"], "without a transfer no teacher is read"),
-        (["transfer=hidden", "agent.hidden_sizes=[64]"], "no layer between"),
+        (["transfer.teacher=runs/x"], "without a transfer no teacher is read; leave it out, or type transfer=hid"),
+        (["transfer.copy_log_alpha=true"], "without a transfer no temperature is copied; leave it out, or type"),
+        (["transfer=hidden", "agent.hidden_sizes=[64]"],
+         "hidden_sizes=[64]: it needs 2 hidden layers or more; type agent.hidden_sizes=[64,64], or type transfer=exp"),
+        (["transfer=direct", "freeze=true"], "type freeze=false, or type transfer=hidden or transfer=expand"),
         (["total_timesteps=-1"], "total_timesteps=-1: an integer of at least 1"),
         (["total_timesteps=1e6"], "type total_timesteps=1000000"),
         (["seed=-1"], "seed=-1: an integer of at least 0"),
@@ -121,7 +131,7 @@ def test_python_defaults_say_what_the_paper_profile_says():
         (["stop=threshold", "stop_after=1000000"], "the run has ended by then (total_timesteps=1000000)"),
         (["env.source=nowhere", "transfer=expand", "output_dir=x"], None),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_run_is_refused_in_one_line(overrides, says):
     if says is None:
         assert spec(*overrides).changes == {"env.source": "nowhere"}
@@ -216,7 +226,7 @@ def without(stored: dict, key: str) -> dict:
 @pytest.mark.parametrize("overrides", [["experiment=A3"], ["experiment=H0", "profile=quick"]])
 def test_a_setting_that_a_stored_run_lacks_had_its_default(overrides):
     config, defaults = spec(*overrides).config, schema_defaults()
-    stored = asdict(config)
+    stored = plain_settings(config)
     assert differing_keys(stored, config) == []
     for key, value in flatten(stored).items():
         neutral = key.split(".")[0] in NEUTRAL_KEYS or key == "transfer.teacher"
@@ -230,7 +240,7 @@ def test_a_setting_that_a_stored_run_lacks_had_its_default(overrides):
 
 def test_a_setting_that_only_a_stored_run_knows_is_a_difference_if_it_was_set():
     config = spec().config
-    stored = asdict(config)
+    stored = plain_settings(config)
     assert differing_keys({**stored, "noise": 0.1}, config) == ["noise"]
     assert differing_keys({**stored, "agent": {**stored["agent"], "layer_norm": False}}, config) == ["agent.layer_norm"]
     assert differing_keys({**stored, "noise": None}, config) == []

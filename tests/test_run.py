@@ -140,8 +140,8 @@ def test_a_teacher_by_path(seven, tmp_path):
     [
         (["sed=1"], "did you mean seed?"),
         (["transfer=hiden"], "did you mean transfer=hidden?"),
-        (["transfer=none", "freeze=true"], "type transfer=hidden freeze=true"),
-        (["transfer=direct"], "27 sensors and 8 actuators, this one 23 sensors and 6 actuators; type transfer=hidden"),
+        (["transfer=none", "freeze=true"], "type freeze=false, or type transfer=hidden"),
+        (["transfer=direct"], "the source environment ant has 27 sensors and 8 actuators, the student 23 sens"),
         (["total_timesteps=-5"], "an integer of at least 1"),
         (["experiment=A2"], "train it with: python run.py profile=quick env=ant seed=1"),
         (["experiment=A2", "transfer.teacher=nowhere"], "no such teacher file"),

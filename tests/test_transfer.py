@@ -1,12 +1,18 @@
 """Each transfer copies exactly what the paper says, bit for bit, and refuses what does not fit."""
 
+import ast
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from acmr.agent.networks import Dimensions, Networks
-from acmr.config import ConfigError, TransferConfig
-from acmr.settings.compose import CONFIG_FOLDER
+from acmr.config import ConfigError, TransferConfig, TransferRules, differing_keys
+from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
+from acmr.settings.run_spec import specify
 from acmr.transfer import methods
 from acmr.transfer.methods import method, method_names, transfer
 
@@ -30,8 +36,14 @@ def student(dims: Dimensions, sizes: tuple[int, ...] = SIZES, seed: int = 1) -> 
     return Networks(dims, sizes, low, high, torch.Generator().manual_seed(seed))
 
 
+def settings(name: str) -> TransferConfig:
+    """The method as its file describes it, rules included; without a file what the schema says."""
+    has_file = (CONFIG_FOLDER / "transfer" / f"{name}.yaml").exists()
+    return parse(compose_config([f"transfer={name}"])).transfer if has_file else TransferConfig(name=name)
+
+
 def run(dims, teacher, name, freeze=False, sizes=SIZES, **options):
-    config = TransferConfig(name=name, **options)
+    config = replace(settings(name), **options)
     return transfer(student(dims, sizes), teacher, config, freeze, torch.Generator().manual_seed(2))
 
 
@@ -103,6 +115,59 @@ def test_a_teacher_that_does_not_fit_is_refused(name, teacher_dims, sizes, core,
 def test_unknown_method_is_refused(teacher_factory):
     with pytest.raises(ConfigError, match="must be one of none, direct, hidden, expand"):
         run(TARGET, teacher_factory(SOURCE, SIZES), "distill")
+
+
+def test_a_method_may_take_other_widths_and_another_body_if_its_rules_do_not_forbid_it(teacher_factory, monkeypatch):
+    monkeypatch.setattr(methods, "_METHODS", {"biases": lambda networks, *_: (networks, ["actor.mean"])})
+    teacher, free = teacher_factory(SOURCE, (10, 8)), TransferRules(same_widths=False)
+    assert run(TARGET, teacher, "biases", rules=free)[1].copied == ["actor.mean"]
+    for broken in (TransferRules(), TransferRules(same_widths=False, same_body=True)):
+        with pytest.raises(ConfigError, match=r"transfer=biases: the teacher .* has "):
+            run(TARGET, teacher, "biases", rules=broken)
+
+
+def test_methods_that_are_named_instead_exist():
+    for name in method_names():
+        assert set(settings(name).rules.instead) <= set(method_names()) - {name}
+
+
+def names_it(path: Path, name: str) -> bool:
+    """Whether a source has the method's name, or what to type for it, in a string that is no docstring."""
+    tree = ast.parse(path.read_text())
+    docstrings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    texts = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and node not in docstrings]
+    return any(text == name or f"transfer={name}" in text for text in texts if isinstance(text, str))
+
+
+@pytest.mark.parametrize("name", ["direct", "hidden", "expand"])
+def test_nobody_but_the_methods_knows_a_methods_name(name):
+    root = CONFIG_FOLDER.parent
+    sources = [path for folder in ("acmr", "sweeps") for path in (root / folder).rglob("*.py")]
+    assert len(sources) > 50
+    knows = {str(path.relative_to(root)) for path in sources if names_it(path, name)}
+    # The records say which method each of the paper's cells has.
+    assert knows <= {"acmr/transfer/methods.py", "acmr/records.py"}
+
+
+def test_rules_are_no_settings():
+    """They stand in no config.yaml and no name, so that a new rule orphans no run; and a method has its own ones."""
+    made = specify(parse(compose_config(["experiment=H1"])))
+    assert made.config.transfer.rules.same_body
+    assert "rules" not in made.settings["transfer"]
+    assert made.name == "humanoid-direct"
+    changed = replace(made.config, transfer=replace(made.config.transfer, rules=TransferRules(min_hidden_layers=0)))
+    assert differing_keys(made.settings, changed) == []
+    for overrides in (["transfer.name=direct"], ["transfer=direct", "transfer.rules.freezable=true"]):
+        with pytest.raises(ConfigError, match=r"no setting, .* conf/transfer/direct.yaml says .* transfer=direct"):
+            specify(parse(compose_config(overrides)))
+
+
+@pytest.mark.parametrize("cell", ["H0", "A0", "A2"])
+def test_the_published_runs_are_still_the_runs_that_their_settings_name(cell):
+    made = specify(parse(compose_config([f"experiment={cell}"])))
+    for stored in (CONFIG_FOLDER.parent / "results" / "paper" / made.name).glob("seed_*/config.yaml"):
+        settings = yaml.safe_load(stored.read_text())
+        assert differing_keys(settings, replace(made.config, seed=settings["seed"])) == []
 
 
 def test_every_method_has_a_yaml_file_and_the_other_way_round():

@@ -21,7 +21,8 @@ from acmr.settings.run_spec import RunSpec, teacher_spec
 from acmr.storage.checkpoint_store import KEPT
 from acmr.storage.run_dir import RunDir
 from acmr.text import size
-from acmr.transfer.methods import NONE, TransferReport, transfer
+from acmr.transfer.methods import check_body, transfer
+from acmr.transfer.report import TransferReport
 from acmr.transfer.teacher import Teacher, load_teacher
 
 #: Logs, settings and whatever is small, in bytes.
@@ -69,13 +70,16 @@ def find_teacher(config: ExperimentConfig, dims: Dimensions) -> Teacher | None:
     Raises:
         ConfigError: If there is none, with the command that trains it.
     """
-    if config.transfer.name == NONE:
+    if not config.transfer.rules.needs_teacher:
         return None
     if config.transfer.teacher is not None:
         return load_teacher(config.transfer.teacher)
     source = teacher_spec(config)
-    if config.transfer.name == "direct":
-        _check_same_body(source.config, dims)
+    if config.transfer.rules.same_body:
+        # Before anybody trains a teacher for days that will be of no use.
+        about = describe(source.config.env)
+        theirs = Dimensions(len(about.observation_names), len(about.action_names))
+        check_body(config.transfer, f"the source environment {source.config.env.name}", theirs, dims)
     path = source.directory / TENSOR_FILE
     if not RunDir(source.directory).is_complete():
         state = "is not finished" if RunDir(source.directory).stored_settings() else "does not exist"
@@ -84,16 +88,6 @@ def find_teacher(config: ExperimentConfig, dims: Dimensions) -> Teacher | None:
             f"train it with: {source.command} (or give another one: transfer.teacher=PATH)"
         )
     return load_teacher(path)
-
-
-def _check_same_body(source: ExperimentConfig, dims: Dimensions) -> None:
-    about = describe(source.env)
-    theirs = Dimensions(len(about.observation_names), len(about.action_names))
-    if theirs != dims:
-        raise ConfigError(
-            f"transfer=direct: the source environment {source.env.name} has {theirs}, this one {dims}; "
-            "type transfer=hidden or transfer=expand between different bodies"
-        )
 
 
 def _check_device(device: str) -> None:

@@ -20,7 +20,8 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue
 
-from acmr.config import ConfigError, EnvConfig, ExperimentConfig, flatten, schema_defaults, validate
+from acmr.config import ConfigError, EnvConfig, ExperimentConfig, flatten, schema_defaults
+from acmr.settings.validate import validate
 
 CONFIG_FOLDER = Path(__file__).resolve().parents[2] / "conf"
 
@@ -109,7 +110,10 @@ def groups() -> list[str]:
 
 @lru_cache(maxsize=256)
 def baseline(profile: str, env: str, env_id: str, transfer: str) -> dict[str, Any]:
-    """The settings, flat, that a profile has for an environment and a transfer where nothing else is said."""
+    """The settings, flat, that a profile has for an environment and a transfer where nothing else is said.
+
+    With the rules of the method.
+    """
     overrides = [f"profile={profile}", f"transfer={transfer}", *env_overrides(env, env_id)]
     return flatten(asdict(parse(compose_config(overrides))))
 

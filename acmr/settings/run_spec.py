@@ -9,12 +9,23 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.config import HORIZON, STOP_KEYS, TEACHER_KEYS, ConfigError, ExperimentConfig, flatten, is_neutral
+from acmr.config import (
+    HORIZON,
+    STOP_KEYS,
+    TEACHER_KEYS,
+    ConfigError,
+    ExperimentConfig,
+    flatten,
+    is_neutral,
+    plain_settings,
+)
 from acmr.records import CELLS, DESCRIPTION_FILE
 from acmr.settings.compose import as_override, baseline, compose_config, env_overrides, parse
 
 #: Settings that a run's name spells out in its own way.
 _NAMED_KEYS = ("seed", "freeze", "transfer.name", "transfer.teacher", "env.name")
+#: What stands in a method's file only.
+_RULES = "transfer.rules."
 _MAX_NAME = 120
 _PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,32}")
 
@@ -43,7 +54,7 @@ class RunSpec:
     @property
     def settings(self) -> dict[str, Any]:
         """All settings as plain data."""
-        return asdict(self.config)
+        return plain_settings(self.config)
 
     @property
     def command(self) -> str:
@@ -96,8 +107,15 @@ def _changes(config: ExperimentConfig) -> dict[str, Any]:
     now = flatten(asdict(config))
     changed = {}
     for key in sorted(set(base) | set(now)):
-        if not is_neutral(key) and key not in _NAMED_KEYS and base.get(key) != now.get(key):
-            changed[key] = now.get(key)
+        if is_neutral(key) or key in _NAMED_KEYS or base.get(key) == now.get(key):
+            continue
+        if key.startswith(_RULES):
+            # As transfer.name=hidden would have it: the method without its rules.
+            raise ConfigError(
+                f"{key}={now.get(key)}: no setting, but what conf/transfer/{config.transfer.name}.yaml says of the "
+                f"method; type transfer={config.transfer.name}"
+            )
+        changed[key] = now.get(key)
     return changed
 
 
@@ -107,7 +125,7 @@ def _short_overrides(spec: RunSpec) -> list[str]:
     said = [f"profile={config.profile}"] if config.profile != "paper" else []
     if config.env.name != default.env.name:
         said += env_overrides(config.env.name, config.env.id)
-    if config.transfer.name != "none":
+    if config.transfer.name != default.transfer.name:
         said.append(f"transfer={config.transfer.name}")
     if config.freeze:
         said.append("freeze=true")

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from acmr.config import THRESHOLD, TrackingConfig
+from acmr.config import THRESHOLD, TrackingConfig, TransferConfig
 from acmr.records import CELLS, VELOCITY_COLUMN, EpisodeRecord
 from acmr.text import one_line
 from acmr.tracking import wandb_backend
@@ -217,7 +217,8 @@ def labels(settings: Mapping[str, Any], run_name: str, cell: str | None) -> dict
     env, transfer, profile = settings["env"], str(settings["transfer"]["name"]), str(settings["profile"])
     # Settings that were stored before there was a choice have none.
     stops = settings.get("stop") == THRESHOLD
-    teaches = transfer == "none" and env["name"] == env["source"]
+    # The schema's default: nothing is transferred. Stored settings do not hold the rules of the method.
+    teaches = transfer == TransferConfig().name and env["name"] == env["source"]
     tags = [
         profile,
         str(env["name"]),

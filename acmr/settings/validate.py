@@ -1,0 +1,125 @@
+"""Refuses settings that cannot be run, before anything is created: one line each, with what to type instead."""
+
+from __future__ import annotations
+
+import math
+
+from acmr.config import (
+    ACTIVATIONS,
+    EXACT,
+    HORIZON,
+    INEXACT,
+    PRECISIONS,
+    PROGRESS_MODES,
+    THRESHOLD,
+    TRACKING_MODES,
+    ConfigError,
+    ExperimentConfig,
+)
+
+
+def validate(config: ExperimentConfig) -> None:
+    """Refuses what cannot be run.
+
+    Args:
+        config: The typed settings.
+
+    Raises:
+        ConfigError: With one line that says what was given, what is allowed and what to type.
+    """
+    agent = config.agent
+    _at_least("seed", config.seed, 0)
+    for key in ("total_timesteps", "consecutive", "threads", "log_every"):
+        _at_least(key, getattr(config, key), 1)
+    for key in ("batch_size", "buffer_size", "policy_frequency", "target_network_frequency"):
+        _at_least(f"agent.{key}", getattr(agent, key), 1)
+    _at_least("agent.learning_starts", agent.learning_starts, 0)
+    if config.checkpoint_every is not None:
+        _at_least("checkpoint_every", config.checkpoint_every, 0)
+    if config.env.max_episode_steps is not None:
+        _at_least("env.max_episode_steps", config.env.max_episode_steps, 1)
+    for key in ("policy_lr", "q_lr", "alpha"):
+        _within(f"agent.{key}", getattr(agent, key), low=0.0, high=math.inf, low_open=True)
+    _within("agent.tau", agent.tau, low=0.0, high=1.0, low_open=True)
+    _within("agent.gamma", agent.gamma, low=0.0, high=1.0)
+    if not math.isfinite(config.threshold):
+        raise ConfigError(f"threshold={config.threshold}: a finite return is needed, as in threshold=4900")
+    if not agent.hidden_sizes or min(agent.hidden_sizes) < 1:
+        raise ConfigError(
+            f"agent.hidden_sizes={agent.hidden_sizes}: one or more widths of at least 1 are needed, "
+            "as in agent.hidden_sizes=[256,256]"
+        )
+    _one_of("agent.precision", agent.precision, PRECISIONS)
+    _one_of("progress", config.progress, PROGRESS_MODES)
+    _one_of("resume", config.resume, (EXACT, INEXACT))
+    _one_of("tracking.mode", config.tracking.mode, TRACKING_MODES)
+    _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
+    _check_transfer(config)
+    _check_stop(config)
+    if config.tracking.mode == "self_hosted" and not config.tracking.base_url:
+        raise ConfigError("tracking=self_hosted needs the server's address: tracking.base_url=http://HOST:PORT")
+
+
+def _check_stop(config: ExperimentConfig) -> None:
+    _one_of("stop", config.stop, (HORIZON, THRESHOLD))
+    after = config.stop_after
+    if after is None:
+        return
+    _at_least("stop_after", after, 1)
+    if config.stop != THRESHOLD:
+        raise ConfigError(
+            f"stop_after={after} stop={config.stop}: only a run that stops at its threshold may end before its last "
+            f"step; type stop=threshold stop_after={after}, or total_timesteps={after} for a shorter run"
+        )
+    # It would change nothing, and give one run two names.
+    if after >= config.total_timesteps:
+        raise ConfigError(
+            f"stop_after={after}: the run has ended by then (total_timesteps={config.total_timesteps}); "
+            "type less, or leave stop_after out"
+        )
+
+
+def _check_transfer(config: ExperimentConfig) -> None:
+    """Holds the settings against the rules of the method, whichever it is."""
+    transfer, rules, sizes = config.transfer, config.transfer.rules, config.agent.hidden_sizes
+    name = f"transfer={transfer.name}"
+    if not rules.needs_teacher and transfer.teacher is not None:
+        raise ConfigError(
+            f"{name} transfer.teacher={transfer.teacher}: without a transfer no teacher is read; "
+            f"leave it out{rules.or_instead}"
+        )
+    if not rules.needs_teacher and transfer.copy_log_alpha:
+        raise ConfigError(
+            f"{name} transfer.copy_log_alpha=true: without a transfer no temperature is copied; "
+            f"leave it out{rules.or_instead}"
+        )
+    if config.freeze and not rules.freezable:
+        why = (
+            "every layer would be frozen and nothing could learn (python -m acmr.evaluation shows what a teacher does)"
+            if rules.needs_teacher
+            else "without a transfer there is nothing to freeze"
+        )
+        raise ConfigError(f"{name} freeze=true: {why}; type freeze=false{rules.or_instead}")
+    if len(sizes) < rules.min_hidden_layers:
+        enough = ",".join(map(str, [*sizes, *sizes[-1:] * rules.min_hidden_layers][: rules.min_hidden_layers]))
+        raise ConfigError(
+            f"{name} agent.hidden_sizes={sizes}: it needs {rules.min_hidden_layers} hidden layers or more; "
+            f"type agent.hidden_sizes=[{enough}]{rules.or_instead}"
+        )
+
+
+def _at_least(key: str, value: int, least: int) -> None:
+    if value < least:
+        raise ConfigError(f"{key}={value}: an integer of at least {least} is needed, as in {key}={max(least, 1)}")
+
+
+def _within(key: str, value: float, *, low: float, high: float, low_open: bool = False) -> None:
+    if not math.isfinite(value) or value < low or value > high or (low_open and value == low):
+        bracket = "(" if low_open else "["
+        upper = "inf)" if math.isinf(high) else f"{high:g}]"
+        raise ConfigError(f"{key}={value}: a number in {bracket}{low:g}, {upper} is needed")
+
+
+def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise ConfigError(f"{key}={value}: must be one of {', '.join(allowed)}")

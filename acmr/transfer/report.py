@@ -1,0 +1,85 @@
+"""What became of each layer of a student: the content of ``transfer.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from acmr.agent.networks import Networks
+from acmr.config import TransferConfig
+from acmr.transfer.teacher import Teacher
+
+
+@dataclass(frozen=True)
+class TransferReport:
+    """Names of the copied, fresh and frozen layers, and how many parameters that is."""
+
+    method: str
+    freeze: bool
+    teacher: dict[str, Any] | None
+    copied: list[str]
+    fresh: list[str]
+    frozen: list[str]
+    parameters: dict[str, int]
+
+    def lines(self) -> list[str]:
+        """The report for a reader, one fact a line."""
+        said = [f"transfer: {self.method}" + (", copied layers frozen" if self.freeze else "")]
+        if self.teacher is not None:
+            said.append(
+                f"  teacher: {self.teacher['path']} ({self.teacher['environment']}, seed {self.teacher['seed']}, "
+                f"{self.teacher['global_step']:,} steps)"
+            )
+        for kind in ("copied", "fresh", "frozen"):
+            names: list[str] = getattr(self, kind)
+            said.append(f"  {kind}: {self.parameters[kind]:,} parameters: {', '.join(names) if names else 'no layer'}")
+        said.append(f"  learning: {self.parameters['trainable']:,} of {self.parameters['total']:,} parameters")
+        return said
+
+
+def report_transfer(
+    networks: Networks,
+    teacher: Teacher | None,
+    config: TransferConfig,
+    freeze: bool,
+    copied: list[str],
+    frozen: list[str],
+) -> TransferReport:
+    """Counts what was done.
+
+    Args:
+        networks: The networks to learn with.
+        teacher: Whom they have something from, if anybody.
+        config: The method.
+        freeze: Whether the copied layers were to be frozen.
+        copied: Names of the layers that hold the teacher's values.
+        frozen: Names of the layers that do not learn.
+    """
+    layers = networks.layers()
+    fresh = [name for name in layers if name not in copied]
+    sizes = {name: sum(parameter.numel() for parameter in layer.parameters()) for name, layer in layers.items()}
+
+    def count(names: Iterable[str]) -> int:
+        return sum(sizes[name] for name in names)
+
+    parameters = {
+        "total": count(layers),
+        "trainable": count(layers) - count(frozen),
+        "copied": count(copied),
+        "fresh": count(fresh),
+        "frozen": count(frozen),
+    }
+    origin = _origin(teacher) if teacher is not None else None
+    return TransferReport(config.name, freeze, origin, copied, fresh, frozen, parameters)
+
+
+def _origin(teacher: Teacher) -> dict[str, Any]:
+    about = teacher.description
+    return {
+        "path": str(teacher.path),
+        "environment": about.environment,
+        "seed": about.seed,
+        "global_step": about.global_step,
+        "sha256": about.sha256,
+    }
