@@ -24,8 +24,7 @@ from acmr.settings.errors import USER_ERRORS, check_booleans, explain, quote_pat
 from acmr.settings.run_spec import RunSpec, specify
 
 #: Words of a sweep, and where Hydra keeps them: they are no settings of a run.
-SWEEP_WORDS = {"plan": "hydra.sweeper.plan", "retries": "hydra.sweeper.retries", "workers": "hydra.launcher.n_jobs"}
-SLURM, SLURM_WORKERS = "hydra/launcher=slurm", "hydra.launcher.array_parallelism"
+SWEEP_WORDS = {word: f"hydra.sweeper.{word}" for word in ("plan", "retries", "workers")}
 
 register_schema()
 
@@ -59,12 +58,11 @@ def _train_job(path: str) -> None:
 
 def _arguments(given: list[str]) -> list[str]:
     """The command line in Hydra's words."""
-    words = SWEEP_WORDS | ({"workers": SLURM_WORKERS} if SLURM in given else {})
     arguments, several = [], False
     for argument in quote_paths(given):
         key, equal, value = argument.partition("=")
-        several = several or key in words
-        arguments.append(f"{words[key]}{equal}{value}" if key in words else argument)
+        several = several or key in SWEEP_WORDS
+        arguments.append(f"{SWEEP_WORDS[key]}{equal}{value}" if key in SWEEP_WORDS else argument)
     return ["--multirun", *arguments] if several else arguments
 
 

@@ -19,6 +19,7 @@ class StagedSweeper(BasicSweeper):
         plan: Whether to print the plan and start nothing.
         retries: How often a run that failed is tried again.
         grace: Seconds that a training has to write its checkpoint when the sweep is stopped.
+        workers: How many runs to train at a time; None: as the launcher's file says.
     """
 
     def __init__(
@@ -28,9 +29,10 @@ class StagedSweeper(BasicSweeper):
         plan: bool = False,
         retries: int = 2,
         grace: float = 20.0,
+        workers: int | None = None,
     ) -> None:
         super().__init__(max_batch_size, params)
-        self.plan, self.retries, self.grace = plan, retries, grace
+        self.settings = {"plan_only": plan, "retries": retries, "grace": grace, "workers": workers}
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Keeps what the launcher will be made of, once the plan is there."""
@@ -57,5 +59,4 @@ class StagedSweeper(BasicSweeper):
                     f"{override.input_line}: has no end; sweep a list, as in {override.key_or_group}=1,2, or range(1,3)"
                 )
         jobs = self.split_arguments(overrides, None)[0]
-        settings = Settings(plan_only=self.plan, retries=self.retries, grace=self.grace)
-        raise SystemExit(run_sweep(jobs, settings, self.config, self.hydra_context))
+        raise SystemExit(run_sweep(jobs, Settings(**self.settings), self.config, self.hydra_context))

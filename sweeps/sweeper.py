@@ -21,11 +21,11 @@ from acmr.records import COMPLETE, RUNNING, STOPPED
 from acmr.settings.compose import CONFIG_FOLDER
 from acmr.text import one_line
 from sweeps.display import Display, print_plan
-from sweeps.engine import LauncherAdapter, make_engine
 from sweeps.estimate import estimate
 from sweeps.folder import FAILED, FINAL, State, SweepFolder, SweepRun, all_folders
 from sweeps.job import STOP_SIGNALS, write_job
-from sweeps.launch import Launch
+from sweeps.launchers.base import LauncherAdapter, make_adapter
+from sweeps.launchers.launch import Launch
 from sweeps.plan import Plan, expand, make_plan
 
 #: Seconds between two looks at the jobs, and those beyond the trainings' own that workers have to end.
@@ -41,11 +41,13 @@ class Settings:
         plan_only: Whether to print the plan and start nothing.
         retries: How often a run that failed is tried again.
         grace: Seconds that a training has to write its checkpoint when the sweep is stopped.
+        workers: How many runs to train at a time; None: as the launcher's file says.
     """
 
     plan_only: bool
     retries: int
     grace: float
+    workers: int | None
 
 
 def run_sweep(jobs: Sequence[Sequence[str]], settings: Settings, config: DictConfig, context: HydraContext) -> int:
@@ -66,8 +68,9 @@ def run_sweep(jobs: Sequence[Sequence[str]], settings: Settings, config: DictCon
     _check(settings)
     specs = expand(jobs)
     plan, output_dir = make_plan(specs), Path(specs[0].config.output_dir)
-    engine = make_engine(config, context, max(run.spec.config.threads for run in plan.runs))
-    workers = max(1, min(engine.workers, len(plan.missing)))
+    threads = max(run.spec.config.threads for run in plan.runs)
+    adapter = make_adapter(config, context, threads, settings.workers)
+    workers = max(1, min(adapter.workers, len(plan.missing)))
     if settings.plan_only:
         print_plan(plan, estimate(plan, output_dir, workers), workers, output_dir)
         return 0
@@ -75,8 +78,8 @@ def run_sweep(jobs: Sequence[Sequence[str]], settings: Settings, config: DictCon
         print(f"{len(plan.runs)} of {len(plan.runs)} runs complete: {_places(plan)}")
         return 0
     _refuse_overlap(plan, output_dir)
-    engine.clear(all_folders(output_dir))
-    return Sweep(plan, output_dir, settings, engine).run()
+    adapter.clear(all_folders(output_dir))
+    return Sweep(plan, output_dir, settings, adapter).run()
 
 
 class Sweep:
@@ -86,11 +89,11 @@ class Sweep:
         plan: What there is to do.
         output_dir: The folder of all runs.
         settings: The sweep's own settings.
-        engine: What runs the jobs.
+        adapter: What starts the workers.
     """
 
-    def __init__(self, plan: Plan, output_dir: Path, settings: Settings, engine: LauncherAdapter) -> None:
-        self._plan, self._settings, self._engine = plan, settings, engine
+    def __init__(self, plan: Plan, output_dir: Path, settings: Settings, adapter: LauncherAdapter) -> None:
+        self._plan, self._settings, self._adapter = plan, settings, adapter
         header = {
             # As it was typed, not as Hydra got it.
             "command": shlex.join(["python", *sys.orig_argv[sys.orig_argv.index(sys.argv[0]) :]]),
@@ -141,7 +144,7 @@ class Sweep:
         number = fruitless = 0
         while self._signal is None and (runs := self._to_launch()):
             before = [self._state(index) for index in runs]
-            launch = Launch(self._engine, self._folder, runs, number)
+            launch = Launch(self._adapter, self._folder, runs, number)
             self._await(launch, board)
             if self._signal is not None:
                 return
@@ -166,7 +169,7 @@ class Sweep:
                 board.say("stopping: the trainings write their checkpoints (once more to end them at once)")
                 launch.cancel()
             # Hundreds of runs may still wait in the workers' queue; handing them out to nobody takes long.
-            quiet = quiet + 1 if self._engine.workers_pick_runs and not self._is_training() else 0
+            quiet = quiet + 1 if self._adapter.workers_pick_runs and not self._is_training() else 0
             if quiet > 2 or time.monotonic() > deadline:
                 break
         self._abandoned = self._abandoned or launch.is_waiting
@@ -184,7 +187,7 @@ class Sweep:
         for index in self._plan.order:
             teacher = self._entries[index].teacher
             taught = COMPLETE if teacher is None else self._state(teacher).state
-            possible = taught == COMPLETE or (self._engine.workers_pick_runs and taught not in FINAL)
+            possible = taught == COMPLETE or (self._adapter.workers_pick_runs and taught not in FINAL)
             if self._state(index).state not in FINAL and possible:
                 found.append(index)
         return found
@@ -195,7 +198,7 @@ class Sweep:
             state = self._folder.state(index)
             if state.state == RUNNING:
                 # On this machine one lost worker takes its siblings along, so that it is no fault of the run.
-                failures = state.failures + (0 if self._engine.workers_pick_runs else 1)
+                failures = state.failures + (0 if self._adapter.workers_pick_runs else 1)
                 lost = FAILED if failures > self._settings.retries else STOPPED
                 self._folder.set_state(index, State(lost, failures, LOST_REASON))
 

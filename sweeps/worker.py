@@ -1,10 +1,16 @@
-"""What a worker does: it takes up a run, trains it in a process of its own, and notes what has become of it."""
+"""A worker of a sweep: takes up a run, trains it in a process of its own, and notes what has become of it.
+
+Hydra's launchers call :func:`work`; other ones start ``python -m sweeps.worker FOLDER``.
+"""
 
 from __future__ import annotations
 
+import argparse
 import os
 import signal
+import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -59,8 +65,12 @@ class Worker:
         self._entries = [SweepRun(**run) for run in header["runs"]]
         self._retries, self._grace = int(header["retries"]), float(header["grace"])
 
-    def take_next(self) -> None:
-        """Takes up the first run that can start; waits while there is none but others may make one ready."""
+    def take_next(self) -> bool:
+        """Takes up the first run that can start; waits while there is none but others may make one ready.
+
+        Returns:
+            Whether there was one.
+        """
         while not self._is_over():
             promising = False
             for index in self._order:
@@ -71,11 +81,12 @@ class Worker:
                     continue
                 with self._folder.claim(index) as mine:
                     if mine and self._folder.state(index).state not in FINAL:
-                        return self._train(index)
+                        self._train(index)
+                        return True
             if not promising:
-                return None
+                return False
             time.sleep(_PAUSE)
-        return None
+        return False
 
     def take(self, index: int) -> None:
         """Takes up one run, unless it has ended."""
@@ -154,3 +165,20 @@ def _reason(code: int, words: str) -> str:
     if code in _ENDED_FROM_OUTSIDE:
         return "ended from outside"
     return words or f"exit code {code}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Trains runs of a sweep until none is left that could start; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m sweeps.worker", description=main.__doc__)
+    parser.add_argument("folder", type=Path, help="the sweep's folder, OUTPUT_DIR/.sweeps/ID")
+    parser.add_argument("--parent", type=int, default=0, help="process that this one must not outlive; 0: none (0)")
+    options = parser.parse_args(arguments)
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    worker = Worker(SweepFolder(options.folder.absolute()), options.parent)
+    while worker.take_next():
+        pass
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -108,6 +108,11 @@ def groups() -> list[str]:
     return sorted({"matrix", *(entry.name for entry in CONFIG_FOLDER.iterdir() if entry.is_dir())} - {"hydra"})
 
 
+def launchers() -> list[str]:
+    """What ``hydra/launcher`` may be; Hydra has more, but those cannot run a sweep of teachers and students."""
+    return sorted(path.stem for path in (CONFIG_FOLDER / "hydra" / "launcher").glob("*.yaml"))
+
+
 @lru_cache(maxsize=256)
 def baseline(profile: str, env: str, env_id: str, transfer: str) -> dict[str, Any]:
     """The settings, flat, that a profile has for an environment and a transfer where nothing else is said.

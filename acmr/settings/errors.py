@@ -11,7 +11,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf.errors import OmegaConfBaseException
 
 from acmr.config import ConfigError, ExperimentConfig, flatten
-from acmr.settings.compose import as_override, groups, setting_keys, unknown_key
+from acmr.settings.compose import as_override, groups, launchers, setting_keys, unknown_key
 
 #: Settings whose entries are free; Hydra adds to them with a plus sign only.
 FREE_KEYS = ("env.kwargs", "transfer.options")
@@ -72,7 +72,7 @@ def check_booleans(overrides: Sequence[str]) -> None:
 
 def _unknown_option(error: MissingConfigException) -> str:
     group, _, option = str(error.missing_cfg_file).removeprefix("/").rpartition("/")
-    options = sorted(error.options or [])
+    options = launchers() if group == "hydra/launcher" else sorted(error.options or [])
     if not group:
         return f"{option}: no such config group; there are {', '.join(groups())}"
     near = get_close_matches(option, options, n=1)
