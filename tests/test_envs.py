@@ -16,8 +16,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs import describe, make_env
-from acmr.envs.__main__ import leaves, read_leaf
-from acmr.settings.compose import compose_config, parse
+from acmr.settings.compose import compose_config, environment_config, options, parse
 
 ROOT = Path(__file__).resolve().parent.parent
 DIMENSIONS = {
@@ -28,7 +27,7 @@ DIMENSIONS = {
     "ant": (27, 8),
     "ant_three_legs": (23, 6),
 }
-NAMED_LEAVES = [name for name in leaves() if name != "gym"]
+NAMED_LEAVES = [name for name in options("env") if name != "gym"]
 
 
 class Toy(gym.Env[Any, Any]):
@@ -65,7 +64,7 @@ def of(env_id: str, **settings: Any) -> EnvConfig:
 
 @pytest.mark.parametrize("name", NAMED_LEAVES)
 def test_every_leaf_builds_resets_and_steps(name: str) -> None:
-    config = read_leaf(name)
+    config = environment_config(name)
     env, description = make_env(config), describe(config)
     assert env.spec is not None
     assert env.spec.max_episode_steps == 1000
@@ -85,16 +84,11 @@ def test_every_leaf_builds_resets_and_steps(name: str) -> None:
 
 
 def test_leaves_are_all_here() -> None:
-    assert set(leaves()) >= {*DIMENSIONS, "gym"}
+    assert set(options("env")) >= {*DIMENSIONS, "gym"}
     pairs = {"paper": "humanoid", "quick": "ant", "paper_v5": "humanoid_v5"}
     for profile, source in pairs.items():
-        assert leaves()[f"{profile}_source"] == source
-        assert read_leaf(f"{profile}_target").source == source
-
-
-@pytest.mark.parametrize("name", NAMED_LEAVES)
-def test_hydra_reads_the_same_as_the_command_line(name: str) -> None:
-    assert parse(compose_config([f"env={name}"])).env == read_leaf(name)
+        assert environment_config(f"{profile}_source") == environment_config(source)
+        assert environment_config(f"{profile}_target").source == source
 
 
 def test_hydra_names_a_gymnasium_environment_by_its_id() -> None:
@@ -105,7 +99,7 @@ def test_hydra_names_a_gymnasium_environment_by_its_id() -> None:
 
 def test_paper_pair_in_the_paper_s_terms() -> None:
     for name in ("paper_source", "paper_target"):
-        env = make_env(read_leaf(name))
+        env = make_env(environment_config(name))
         assert isinstance(env.action_space, Box)
         assert set(env.action_space.low) == {np.float32(-0.4)}
         assert set(env.action_space.high) == {np.float32(0.4)}
@@ -115,14 +109,14 @@ def test_paper_pair_in_the_paper_s_terms() -> None:
         for height, over in ((1.01, False), (0.99, True), (1.99, False), (2.01, True)):
             robot.data.qpos[2] = height
             assert robot.terminated is over
-    assert describe(read_leaf("humanoid")).reward_terms == ("reward_linvel", "reward_quadctrl", "reward_alive")
+    assert describe(environment_config("humanoid")).reward_terms == ("reward_linvel", "reward_quadctrl", "reward_alive")
 
 
 def test_humanoid_is_bitwise_gymnasium_s() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         theirs = gym.make("Humanoid-v4")
-    ours = make_env(read_leaf("humanoid"))
+    ours = make_env(environment_config("humanoid"))
     rng = np.random.default_rng(0)
     assert np.array_equal(ours.reset(seed=5)[0], theirs.reset(seed=5)[0])
     episodes = 0
@@ -138,13 +132,13 @@ def test_humanoid_is_bitwise_gymnasium_s() -> None:
 
 
 def test_no_wrapper_slows_a_step_down() -> None:
-    env = make_env(read_leaf("armless_humanoid"))
+    env = make_env(environment_config("armless_humanoid"))
     assert isinstance(env, gym.wrappers.TimeLimit)
     assert env.env is env.unwrapped
 
 
 def test_time_limit() -> None:
-    env = make_env(replace(read_leaf("ant"), max_episode_steps=3))
+    env = make_env(replace(environment_config("ant"), max_episode_steps=3))
     env.reset(seed=0)
     assert [env.step(np.zeros(8, np.float32))[3] for _ in range(3)] == [False, False, True]
     endless = make_env(of("AcmrEndlessToy-v0")).spec
@@ -161,7 +155,7 @@ def test_kwargs_reach_the_environment() -> None:
 
 
 def test_trying_out_leaves_the_randomness_alone() -> None:
-    first, second = (make_env(read_leaf("ant")).reset()[0] for _ in range(2))
+    first, second = (make_env(environment_config("ant")).reset()[0] for _ in range(2))
     assert not np.array_equal(first, second)
 
 
@@ -179,12 +173,12 @@ def test_several_dimensions_are_flattened() -> None:
 
 
 def test_hash_tells_models_apart_and_only_those() -> None:
-    hashes = {name: describe(read_leaf(name)).model_hash for name in DIMENSIONS}
+    hashes = {name: describe(environment_config(name)).model_hash for name in DIMENSIONS}
     assert hashes["humanoid"] == hashes["humanoid_v5"]
     assert len(set(hashes.values())) == 4
     code = (
-        "from acmr.envs import describe; from acmr.envs.__main__ import read_leaf;"
-        "print(describe(read_leaf('ant_three_legs')).model_hash)"
+        "from acmr.envs import describe; from acmr.settings.compose import environment_config;"
+        "print(describe(environment_config('ant_three_legs')).model_hash)"
     )
     again = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert again.stdout.strip() == hashes["ant_three_legs"]
@@ -240,6 +234,6 @@ def test_what_cannot_run_gives_one_line(config: EnvConfig, message: str) -> None
 
 def test_unknown_render_mode() -> None:
     with pytest.raises(ConfigError, match=r"render_mode=video: Humanoid-v4 offers .*rgb_array"):
-        make_env(read_leaf("humanoid"), render_mode="video")
+        make_env(environment_config("humanoid"), render_mode="video")
     with pytest.raises(ConfigError, match="offers none"):
         make_env(of("AcmrToy-v0"), render_mode="rgb_array")

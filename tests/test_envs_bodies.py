@@ -14,8 +14,8 @@ import pytest
 
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs import describe, make_env
-from acmr.envs.__main__ import read_leaf
 from acmr.envs.bodies import edited_model
+from acmr.settings.compose import environment_config
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 ARMS = ["right_upper_arm", "left_upper_arm"]
@@ -115,8 +115,8 @@ def test_three_legged_ant_moves_as_the_hand_edited_one() -> None:
 
 
 def test_masses() -> None:
-    full: Any = make_env(read_leaf("humanoid")).unwrapped
-    armless: Any = make_env(read_leaf("armless_humanoid")).unwrapped
+    full: Any = make_env(environment_config("humanoid")).unwrapped
+    armless: Any = make_env(environment_config("armless_humanoid")).unwrapped
     arms = [full.model.body(f"{side}_{part}_arm").mass[0] for side in ("left", "right") for part in ("upper", "lower")]
     assert full.model.body_mass.sum() == pytest.approx(42.1, abs=0.05)
     assert armless.model.body_mass.sum() == pytest.approx(36.3, abs=0.05)

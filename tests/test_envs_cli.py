@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from guides import ROOT, copy_checkout, follow
 
-from acmr.config import ConfigError
 from acmr.envs import describe
-from acmr.envs.__main__ import main, read_leaf
-
-ROOT = Path(__file__).resolve().parent.parent
+from acmr.settings.compose import environment_config
 
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "acmr.envs", *arguments]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+def listed(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int | str | None:
+    """Runs the command line in this process; returns the exit code."""
+    monkeypatch.setattr(sys, "argv", ["acmr.envs", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("acmr.envs", run_name="__main__")
+    return ended.value.code
 
 
 def test_names_of_one_environment_from_any_folder(tmp_path: Path) -> None:
@@ -30,7 +37,7 @@ def test_names_of_one_environment_from_any_folder(tmp_path: Path) -> None:
     assert "270 observations, 11 actions, 1000 steps an episode" in comments[1]
     assert "left_foot" in comments[2]
     assert "arm" not in comments[2]
-    description = describe(read_leaf("armless_humanoid"))
+    description = describe(environment_config("armless_humanoid"))
     assert [row[:3] for row in rows[:270]] == [
         ["observation", str(index), name] for index, name in enumerate(description.observation_names)
     ]
@@ -67,12 +74,12 @@ def test_a_reader_that_stops_early(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
-def test_gymnasium_ids(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["Hopper-v5"]) == 0
+def test_gymnasium_ids(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert listed(monkeypatch, "Hopper-v5") == 0
     shown = capsys.readouterr().out
     assert "# 11 observations, 3 actions, 1000 steps an episode" in shown
     assert "observation    0  qpos/rootz\n" in shown
-    assert main(["Pendulum-v1"]) == 0
+    assert listed(monkeypatch, "Pendulum-v1") == 0
     assert "observation    2  obs/2\n" in capsys.readouterr().out
 
 
@@ -85,32 +92,18 @@ def test_gymnasium_ids(capsys: pytest.CaptureFixture[str]) -> None:
         ("no_such_package:Robot-v0", "cannot import no_such_package"),
     ],
 )
-def test_errors_are_one_line(name: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([name]) == 2
+def test_errors_are_one_line(
+    name: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert listed(monkeypatch, name) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
 
 
-def test_a_leaf_builds_on_another(tmp_path: Path) -> None:
-    (tmp_path / "base.yaml").write_text("name: base\nid: Ant-v5\nsource: base\nkwargs: {a: 1, b: 2}\n")
-    (tmp_path / "limp.yaml").write_text("defaults: [base]\nname: limp\nkwargs: {b: 3}\ndrop_actuators: [hip_1]\n")
-    config = read_leaf("limp", tmp_path)
-    assert (config.name, config.id, config.source) == ("limp", "Ant-v5", "base")
-    assert config.kwargs == {"a": 1, "b": 3}
-    assert config.drop_actuators == ["hip_1"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("id: Ant-v5\nremove_body: [a]\n", "remove_body is no setting; there are name, id"),
-        ("id: [", "cannot be read"),
-        ("- a\n- b\n", "cannot be read"),
-    ],
-)
-def test_a_damaged_leaf(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "bad.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=message) as caught:
-        read_leaf("bad", tmp_path)
-    assert "\n" not in str(caught.value)
+def test_the_commands_of_the_guide(tmp_path: Path) -> None:
+    folder = copy_checkout(tmp_path / "checkout")
+    said = follow(ROOT / "docs" / "howto-environment.md", folder)
+    assert "one_armed_humanoid" not in said.partition("# armless_humanoid")[0]  # not written yet
+    assert "# my_robots:Cart-v0" in said
+    assert "# 2 observations, 1 actions, 200 steps an episode" in said

@@ -12,8 +12,8 @@ from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 
 from acmr.config import EnvConfig
 from acmr.envs import describe, make_env
-from acmr.envs.__main__ import leaves, read_leaf
 from acmr.envs.naming import part_names
+from acmr.settings.compose import environment_config, options
 
 COMPONENTS = {"x": 0, "y": 1, "z": 2, "qw": 3, "qx": 4, "qy": 5, "qz": 6, "wx": 3, "wy": 4, "wz": 5}
 #: What environments show only within limits.
@@ -32,7 +32,9 @@ def of(env_id: str, **settings: Any) -> EnvConfig:
     return EnvConfig(name=env_id, id=env_id, source=env_id, **settings)
 
 
-EVERYWHERE = [read_leaf(name) for name in leaves() if name != "gym"] + [of(env_id) for env_id in GYMNASIUM]
+EVERYWHERE = [environment_config(name) for name in options("env") if name != "gym"] + [
+    of(env_id) for env_id in GYMNASIUM
+]
 EVERYWHERE += [
     of("Humanoid-v4", kwargs={"exclude_current_positions_from_observation": False}),
     of("Humanoid-v5", kwargs={"include_cvel_in_observation": False, "include_cinert_in_observation": False}),
@@ -83,8 +85,8 @@ def test_names_name_the_values(config: EnvConfig) -> None:
 
 
 def test_rows_move_with_the_joint_they_name() -> None:
-    env = make_env(read_leaf("armless_humanoid"))
-    names = describe(read_leaf("armless_humanoid")).observation_names
+    env = make_env(environment_config("armless_humanoid"))
+    names = describe(environment_config("armless_humanoid")).observation_names
     robot: Any = env.unwrapped
     before, _ = env.reset(seed=0)
     robot.data.joint("right_knee").qvel[0] += 0.125
@@ -106,8 +108,8 @@ def test_clipped_velocities_keep_their_names() -> None:
 
 @pytest.mark.parametrize(("whole", "part"), [("humanoid", "armless_humanoid"), ("humanoid_v5", "armless_humanoid_v5")])
 def test_armless_names_are_among_the_full_ones_with_the_same_values(whole: str, part: str) -> None:
-    envs = [make_env(read_leaf(name)) for name in (whole, part)]
-    described = [describe(read_leaf(name)) for name in (whole, part)]
+    envs = [make_env(environment_config(name)) for name in (whole, part)]
+    described = [describe(environment_config(name)) for name in (whole, part)]
     full, armless = (description.observation_names for description in described)
     assert set(armless) < set(full)
     assert described[1].action_names == described[0].action_names[: len(described[1].action_names)]

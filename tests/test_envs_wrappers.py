@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs import describe, make_env
-from acmr.envs.__main__ import read_leaf
 from acmr.envs.wrappers import PartialEnv, kept_rows
+from acmr.settings.compose import environment_config
 
-ANT = read_leaf("ant")
+ANT = environment_config("ant")
 NAMES = ("qpos/root/z", "qpos/knee", "qvel/root/z", "qvel/knee")
 
 
@@ -101,12 +101,14 @@ def test_dropped_actuators_get_a_neutral_command() -> None:
 
 
 def test_description_has_what_is_left() -> None:
-    config = replace(read_leaf("armless_humanoid"), drop_sensors=["c*", "qfrc_*"], drop_actuators=["*_knee", 0])
+    config = replace(
+        environment_config("armless_humanoid"), drop_sensors=["c*", "qfrc_*"], drop_actuators=["*_knee", 0]
+    )
     env, description = make_env(config), describe(config)
     assert len(description.observation_names) == 33 == len(env.reset(seed=0)[0])
     assert description.action_names[0] == "abdomen_z"
     assert len(description.action_names) == 8
-    assert describe(read_leaf("armless_humanoid")).model_hash == description.model_hash
+    assert describe(environment_config("armless_humanoid")).model_hash == description.model_hash
 
 
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "MountainCarContinuous-v0", "Hopper-v5"])

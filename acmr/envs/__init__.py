@@ -1,4 +1,4 @@
-"""The environments an agent can be trained in, made from their settings.
+"""Makes and describes the environments that agents are trained in, from their settings.
 
 env = make_env(config.env)
 description = describe(config.env)
@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
+from gymnasium.spaces import Box
 
-from acmr.config import ConfigError, EnvConfig
+from acmr.config import EnvConfig
 from acmr.envs.construct import cannot_run, construct
-from acmr.envs.naming import Probe, probe
+from acmr.envs.naming import part_names, probe
 from acmr.envs.wrappers import PartialEnv, kept_rows
 from acmr.records import VELOCITY_KEY
 
@@ -31,6 +32,10 @@ class EnvDescription:
     Attributes:
         observation_names: One per observation.
         action_names: One per action.
+        action_low: Least value of each action.
+        action_high: Greatest value of each action.
+        max_episode_steps: Steps an episode may take; None: it has no time limit.
+        bodies: Names of the MuJoCo bodies without the world; empty where there is no MuJoCo model.
         reward_terms: Keys of ``info`` that begin with ``reward_``: the parts that the reward is made of.
         has_forward_velocity: Whether ``info`` holds ``x_velocity``, in m/s.
         model_hash: SHA-256 (hex) of the compiled MuJoCo model, or of the registration where there is no model.
@@ -38,9 +43,17 @@ class EnvDescription:
 
     observation_names: tuple[str, ...]
     action_names: tuple[str, ...]
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
+    max_episode_steps: int | None
+    bodies: tuple[str, ...]
     reward_terms: tuple[str, ...]
     has_forward_velocity: bool
     model_hash: str
+
+
+#: What was seen of environments with all their sensors and actuators, by the settings that they were made from.
+_tried_out: dict[str, EnvDescription] = {}
 
 
 def make_env(config: EnvConfig, render_mode: str | None = None) -> gym.Env[np.ndarray, np.ndarray]:
@@ -55,46 +68,67 @@ def make_env(config: EnvConfig, render_mode: str | None = None) -> gym.Env[np.nd
     Raises:
         ConfigError: With one line that says what is wrong with the settings.
     """
-    seen = _try_out(config)[0]
+    whole = _try_out(config)
     env = construct(config, render_mode)
-    sensors, actuators = _kept(config, seen)
-    whole = len(sensors) == len(seen.observation_names) and len(actuators) == len(seen.action_names)
+    sensors, actuators = _kept(config, whole)
+    all_kept = len(sensors) == len(whole.observation_names) and len(actuators) == len(whole.action_names)
     flat = len(env.observation_space.shape or ()) == 1 and len(env.action_space.shape or ()) == 1
-    return env if whole and flat else PartialEnv(env, sensors, actuators)
+    return env if all_kept and flat else PartialEnv(env, sensors, actuators)
 
 
 def describe(config: EnvConfig) -> EnvDescription:
-    """Describes an environment, by trying out a throwaway instance of it.
+    """Describes an environment; the first time in a process, a throwaway instance is tried out for that.
 
     Raises:
         ConfigError: As :func:`make_env`.
     """
-    seen, model_hash = _try_out(config)
-    sensors, actuators = _kept(config, seen)
-    return EnvDescription(
-        observation_names=tuple(seen.observation_names[row] for row in sensors),
-        action_names=tuple(seen.action_names[row] for row in actuators),
-        reward_terms=tuple(key for key in seen.info_keys if key.startswith("reward_")),
-        has_forward_velocity=VELOCITY_KEY in seen.info_keys,
-        model_hash=model_hash,
+    whole = _try_out(config)
+    sensors, actuators = _kept(config, whole)
+    return replace(
+        whole,
+        observation_names=tuple(whole.observation_names[row] for row in sensors),
+        action_names=tuple(whole.action_names[row] for row in actuators),
+        action_low=tuple(whole.action_low[row] for row in actuators),
+        action_high=tuple(whole.action_high[row] for row in actuators),
     )
 
 
-def _try_out(config: EnvConfig) -> tuple[Probe, str]:
-    env = construct(config)
-    try:
-        return probe(env), _hash(env)
-    except ConfigError:
-        raise
-    except Exception as error:
-        raise cannot_run(config, error) from error
-    finally:
-        env.close()
+def _try_out(config: EnvConfig) -> EnvDescription:
+    """Describes the environment with all its sensors and actuators."""
+    # Not the name, the teacher and what is dropped: none of them changes what is constructed.
+    made_from = (config.id, config.kwargs, config.remove_bodies, config.max_episode_steps)
+    key = json.dumps(made_from, sort_keys=True, default=repr)
+    if key not in _tried_out:
+        env = construct(config)
+        try:
+            _tried_out[key] = _look_at(env)
+        except Exception as error:
+            raise cannot_run(config, error) from error
+        finally:
+            env.close()
+    return _tried_out[key]
 
 
-def _kept(config: EnvConfig, seen: Probe) -> tuple[np.ndarray, np.ndarray]:
-    sensors = kept_rows(config.drop_sensors, seen.observation_names, key="drop_sensors", environment=config.name)
-    actuators = kept_rows(config.drop_actuators, seen.action_names, key="drop_actuators", environment=config.name)
+def _look_at(env: gym.Env[Any, Any]) -> EnvDescription:
+    seen, actions, model = probe(env), env.action_space, getattr(env.unwrapped, "model", None)
+    assert isinstance(actions, Box)
+    assert env.spec is not None
+    return EnvDescription(
+        observation_names=seen.observation_names,
+        action_names=seen.action_names,
+        action_low=tuple(actions.low.ravel().tolist()),
+        action_high=tuple(actions.high.ravel().tolist()),
+        max_episode_steps=env.spec.max_episode_steps,
+        bodies=part_names(model).bodies[1:] if isinstance(model, mujoco.MjModel) else (),
+        reward_terms=tuple(key for key in seen.info_keys if key.startswith("reward_")),
+        has_forward_velocity=VELOCITY_KEY in seen.info_keys,
+        model_hash=_hash(env),
+    )
+
+
+def _kept(config: EnvConfig, whole: EnvDescription) -> tuple[np.ndarray, np.ndarray]:
+    sensors = kept_rows(config.drop_sensors, whole.observation_names, key="drop_sensors", environment=config.name)
+    actuators = kept_rows(config.drop_actuators, whole.action_names, key="drop_actuators", environment=config.name)
     return sensors, actuators
 
 

@@ -11,7 +11,6 @@ import torch
 
 from acmr.agent.networks import Actor
 from acmr.config import EnvConfig
-from acmr.evaluation.camera import is_robot
 from acmr.evaluation.video import Film
 from acmr.records import EpisodeInProgress
 
@@ -103,11 +102,9 @@ def play(
 
 def render_mode(config: EnvConfig) -> str | None:
     """How an environment must be made to be drawn: robots are drawn from outside."""
-    from acmr.envs import make_env
+    from acmr.envs import describe
 
-    env = make_env(config)
-    env.close()
-    return None if is_robot(env) else "rgb_array"
+    return None if describe(config).bodies else "rgb_array"
 
 
 def _act(actor: Actor, observation: np.ndarray, noise: torch.Generator | None) -> np.ndarray:

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 
 from acmr.agent.networks import Dimensions, Networks
 from acmr.agent.replay_files import replay_bytes
-from acmr.config import ConfigError, EnvConfig, ExperimentConfig
-from acmr.envs import EnvDescription, describe, make_env
+from acmr.config import ConfigError, ExperimentConfig
+from acmr.envs import EnvDescription, describe
 from acmr.records import TENSOR_FILE
 from acmr.run.random_streams import RandomStreams, random_streams
 from acmr.settings.run_spec import RunSpec, teacher_spec
@@ -49,19 +48,12 @@ def prepare(spec: RunSpec) -> Prepared:
     dims = Dimensions(len(about.observation_names), len(about.action_names))
     teacher = find_teacher(config, dims)
     streams = random_streams(config.seed, config.device)
-    low, high = _action_bounds(config.env)
+    low, high = np.array(about.action_low), np.array(about.action_high)
     fresh = Networks(dims, config.agent.hidden_sizes, low, high, streams.networks)
     networks, report = transfer(fresh, teacher, config.transfer, config.freeze, streams.networks)
     copied_alpha = teacher is not None and config.transfer.copy_log_alpha
     log_alpha = teacher.description.log_alpha if teacher is not None and copied_alpha else 0.0
     return Prepared(spec, about, networks, report, log_alpha, streams)
-
-
-def _action_bounds(config: EnvConfig) -> tuple[np.ndarray, np.ndarray]:
-    env = make_env(config)
-    env.close()
-    assert isinstance(env.action_space, Box)
-    return env.action_space.low, env.action_space.high
 
 
 def find_teacher(config: ExperimentConfig, dims: Dimensions) -> Teacher | None:

@@ -1,4 +1,7 @@
-"""Hydra's errors in one line each: what was given, what is allowed, what to type instead."""
+"""Turns Hydra's errors into one line each: what was given, what is allowed, what to type instead.
+
+Hydra tells its errors apart by their texts only, so this goes by texts, too; tests/test_config.py has one of each.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,18 @@ from difflib import get_close_matches
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from acmr.config import ConfigError, ExperimentConfig, flatten
-from acmr.settings.compose import as_override, groups, launchers, setting_keys, unknown_key
+from acmr.settings.compose import as_override, groups, launchers, options, setting_keys, unknown_key
+from acmr.text import message
 
 #: Settings whose entries are free; Hydra adds to them with a plus sign only.
 FREE_KEYS = ("env.kwargs", "transfer.options")
 #: Settings that are paths. Names of runs hold equal signs, which Hydra's grammar wants quoted.
 PATH_KEYS = ("transfer.teacher", "output_dir", "tracking.dir")
-USER_ERRORS = (ConfigError, HydraException, OmegaConfBaseException)
+#: What a wrong command line or a wrong file of ``conf/`` raises.
+USER_ERRORS = (ConfigError, HydraException, OmegaConfBaseException, YAMLError)
 
 
 def explain(error: BaseException) -> str:
@@ -30,13 +36,21 @@ def explain(error: BaseException) -> str:
         return _unknown_option(error)
     if isinstance(error, OverrideParseException):
         return f"{error.override}: not of the form key=value; quote values with special characters: 'key=\"value\"'"
+    if isinstance(error, YAMLError):
+        return f"not readable as YAML: {message(error)}"
     text = str(error)
     if isinstance(error, ConfigCompositionException):
-        if match := re.match(r"(?:Could not override|Could not append.*|Key) '([^']+)'", text):
+        if match := re.match(r"In '([^']+)': \w+ raised while composing config:\n(.*)\n *full_key: (.*)", text):
+            return _wrong_file(*match.groups())
+        if match := re.match(r"(?:Could not override|Key) '([^']+)'", text):
             key = match[1].split("@")[0]
             if key in FREE_KEYS:
                 return f"{key}: entries are added one by one; type +{key}.NAME=VALUE"
+            if key.startswith(tuple(f"{free}." for free in FREE_KEYS)):
+                return f"{key}: there is no such entry yet; type +{key}=VALUE to add it"
             return unknown_key(key)
+        if match := re.match(r"Could not append to config. An item is already at '([^']+)'", text):
+            return f"+{match[1]}: this setting is there already; type {match[1]}=VALUE"
         if match := re.match(r"Error merging override (.*)", text):
             return _wrong_type(match[1], error)
     return text.strip().splitlines()[0] if text.strip() else type(error).__name__
@@ -72,12 +86,22 @@ def check_booleans(overrides: Sequence[str]) -> None:
 
 def _unknown_option(error: MissingConfigException) -> str:
     group, _, option = str(error.missing_cfg_file).removeprefix("/").rpartition("/")
-    options = launchers() if group == "hydra/launcher" else sorted(error.options or [])
     if not group:
         return f"{option}: no such config group; there are {', '.join(groups())}"
-    near = get_close_matches(option, options, n=1)
+    # Hydra lists none where it is a file that names what does not exist.
+    allowed = launchers() if group == "hydra/launcher" else sorted(error.options or options(group))
+    near = get_close_matches(option, allowed, n=1)
     hint = f"; did you mean {group}={near[0]}?" if near else ""
-    return f"{group}={option}: must be one of {', '.join(options)}{hint}"
+    file = re.match(r"In '([^']+)': Could not load", str(error))
+    place = f"conf/{file[1]}.yaml: " if file and file[1] != "config" else ""
+    return f"{place}{group}={option}: must be one of {', '.join(allowed)}{hint}"
+
+
+def _wrong_file(file: str, reason: str, key: str) -> str:
+    """One line on a file of ``conf/`` that does not fit the settings' types."""
+    if re.match(r"Key '.*' not in", reason):
+        return f"conf/{file}.yaml: {unknown_key(key)}"
+    return f"conf/{file}.yaml: {f'{key}: ' if key else ''}{reason}"
 
 
 def _wrong_type(override: str, error: BaseException) -> str:
