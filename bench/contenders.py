@@ -6,13 +6,15 @@ import os
 import threading
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
 
-from acmr.agent.networks import Dimensions, Networks, is_adapter, is_hidden
+from acmr.agent.architecture import Architecture, Dimensions, is_adapter, is_hidden
+from acmr.agent.networks import Networks
 from acmr.agent.precision import choose_products
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.agent.sac import SAC
@@ -37,8 +39,10 @@ def cell_networks(cell: str, source: Dimensions, target: Dimensions, hidden_size
     """Networks with the shapes and frozen layers of one of the paper's cells; the weights are random."""
     dims = source if cell in ("H0", "H1") else target
     high, generator = np.full(dims.action, 0.4, np.float32), torch.Generator().manual_seed(0)
-    core = source if cell in ("A3", "A4") else None
-    networks = Networks(dims, hidden_sizes, -high, high, generator, core)
+    architecture = Architecture.plain(dims, hidden_sizes, -high, high)
+    if cell in ("A3", "A4"):
+        architecture = replace(architecture, core=source)
+    networks = Networks(architecture, generator)
     for name, layer in networks.layers().items():
         frozen = (cell == "A2" and is_hidden(name)) or (cell == "A4" and not is_adapter(name))
         layer.requires_grad_(not frozen)
@@ -58,7 +62,7 @@ def ours_with_environment(*overrides: str) -> tuple[Steps, gym.Env]:
     assert isinstance(env.action_space, gym.spaces.Box)
     dims = Dimensions(len(about.observation_names), len(about.action_names))
     streams, low, high = random_streams(config.seed), env.action_space.low, env.action_space.high
-    networks = Networks(dims, config.agent.hidden_sizes, low, high, streams.networks)
+    networks = Networks(Architecture.plain(dims, config.agent.hidden_sizes, low, high), streams.networks)
     agent = SAC(networks, config.agent, streams.acting, streams.learning)
     buffer = ReplayBuffer(config.agent.buffer_size, dims.observation, dims.action)
     episode = EpisodeInProgress(about.reward_terms, about.has_forward_velocity)

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import torch
 
-from acmr.agent.networks import Dimensions
+from acmr.agent.architecture import Dimensions
 from acmr.agent.precision import choose_products
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.agent.sac import SAC

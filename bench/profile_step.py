@@ -14,8 +14,8 @@ from typing import Any
 import torch
 
 from acmr.agent import replay_buffer, sac
+from acmr.agent.architecture import Dimensions
 from acmr.agent.kernels import layers, parameters, policy
-from acmr.agent.networks import Dimensions
 from bench import contenders, work
 
 #: Method, and the line of the report that its own time (without that of methods below it) is counted to.

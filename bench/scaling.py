@@ -10,7 +10,8 @@ import time
 import numpy as np
 import torch
 
-from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.networks import Networks
 from bench import updates, work
 
 BASE = {"batch": 256, "width": 256, "observation": 376}
@@ -36,7 +37,8 @@ def main() -> int:
 def measure(settings: dict[str, int]) -> tuple[float, float]:
     """Median milliseconds of CPU time, and the GFLOP of the products, of an update."""
     dims, high = Dimensions(settings["observation"], ACTIONS), np.full(ACTIONS, 0.4, np.float32)
-    networks = Networks(dims, [settings["width"]] * 2, -high, high, torch.Generator().manual_seed(0))
+    architecture = Architecture.plain(dims, [settings["width"]] * 2, -high, high)
+    networks = Networks(architecture, torch.Generator().manual_seed(0))
     take = updates.updates(networks, settings["batch"], transitions=2_000)
     take(6)
     times = []

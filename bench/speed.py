@@ -58,7 +58,7 @@ def measure(rounds: int, steps: int) -> dict[str, Any]:
     """Takes turns; returns seconds a step of every contender and round, and the work that a step is."""
     import torch
 
-    from acmr.agent.networks import Dimensions
+    from acmr.agent.architecture import Dimensions
     from acmr.agent.precision import use_fast_float32
     from bench import contenders, updates, work
 

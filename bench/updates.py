@@ -18,7 +18,7 @@ TWINS = ("A1", "A2", "A3", "A4")
 
 def updates(networks: Networks, batch_size: int = 256, transitions: int = 5_000) -> Callable[[int], None]:
     """A function that makes some updates on batches of random transitions."""
-    config = SACConfig(hidden_sizes=list(networks.hidden_sizes), batch_size=batch_size)
+    config = SACConfig(hidden_sizes=list(networks.architecture.hidden_sizes), batch_size=batch_size)
     agent = SAC(networks, config, torch.Generator().manual_seed(1), torch.Generator().manual_seed(2))
     precision = choose_products(config).precision
     dims, rng = networks.dims, np.random.default_rng(0)

@@ -3,6 +3,7 @@
 import signal
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 import torch
 from hypothesis import settings
 
-from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.networks import Networks
 from acmr.transfer.teacher import FORMAT_VERSION, Teacher, TeacherDescription, load_teacher, save_teacher
 
 torch.set_num_threads(1)
@@ -33,7 +35,8 @@ def teacher_factory(tmp_path: Path) -> Callable[..., Teacher]:
         dims: Dimensions, hidden_sizes: tuple[int, ...], seed: int = 99, core: Dimensions | None = None
     ) -> Teacher:
         low, high = np.full(dims.action, -1, np.float32), np.full(dims.action, 1, np.float32)
-        networks = Networks(dims, hidden_sizes, low, high, torch.Generator().manual_seed(seed), core)
+        architecture = replace(Architecture.plain(dims, hidden_sizes, low, high), core=core)
+        networks = Networks(architecture, torch.Generator().manual_seed(seed))
         folder = tmp_path / f"teacher-{dims.observation}-{dims.action}-{len(hidden_sizes)}-{seed}-{bool(core)}"
         folder.mkdir(exist_ok=True)
         description = TeacherDescription(

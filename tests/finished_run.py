@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,8 @@ import torch
 import yaml
 from gymnasium.spaces import Box
 
-from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.networks import Networks
 from acmr.config import EnvConfig
 from acmr.envs import describe, make_env
 from acmr.transfer.teacher import FORMAT_VERSION, TeacherDescription, save_teacher
@@ -33,7 +34,8 @@ def make_run(path: Path, core: Dimensions | None = None) -> Path:
     space = env.action_space
     assert isinstance(space, Box)
     low, high = space.low, space.high
-    networks = Networks(dims, (32, 32), low, high, torch.Generator().manual_seed(5), core)
+    architecture = replace(Architecture.plain(dims, (32, 32), low, high), core=core)
+    networks = Networks(architecture, torch.Generator().manual_seed(5))
     path.mkdir(parents=True)
     description = TeacherDescription(
         format_version=FORMAT_VERSION, environment=ANT.name, environment_id=ANT.id, model_hash=about.model_hash,

@@ -12,7 +12,7 @@ import yaml
 from finished_run import ANT, make_run, result
 from safetensors.numpy import load_file
 
-from acmr.agent.networks import Dimensions
+from acmr.agent.architecture import Dimensions
 from acmr.envs import make_env
 from acmr.evaluation.cli import main
 

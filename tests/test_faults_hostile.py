@@ -13,7 +13,7 @@ import yaml
 from safetensors.numpy import save as save_arrays
 from torture import ANT, Run, at_step
 
-from acmr.agent.networks import Dimensions
+from acmr.agent.architecture import Dimensions
 from acmr.config import ConfigError
 from acmr.storage.checkpoint_store import Snapshot, SnapshotStore
 from acmr.storage.run_dir import RunDir

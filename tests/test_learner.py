@@ -9,11 +9,12 @@ import torch
 from torch import nn
 
 from acmr.agent import precision as matmul_precision
+from acmr.agent.architecture import Architecture, Dimensions
 from acmr.agent.kernels import arrays
 from acmr.agent.kernels.layers import CriticStack, Stack, columns
 from acmr.agent.kernels.parameters import Adam, FlatParameters
 from acmr.agent.kernels.policy import SquashedGaussian
-from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.networks import Networks
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.agent.sac import SAC
 from acmr.config import PRECISIONS, SACConfig
@@ -28,7 +29,7 @@ def generator(seed: int) -> torch.Generator:
 
 
 def make_networks(core: Dimensions | None = None, sizes: tuple[int, ...] = (24, 20)) -> Networks:
-    return Networks(DIMS, sizes, LOW, HIGH, generator(0), core)
+    return Networks(replace(Architecture.plain(DIMS, sizes, LOW, HIGH), core=core), generator(0))
 
 
 def make_agent(core: Dimensions | None = None, precision: str = "float32") -> SAC:

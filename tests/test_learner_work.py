@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from acmr.agent.networks import Dimensions
+from acmr.agent.architecture import Dimensions
 from acmr.agent.replay_buffer import Batch
 from acmr.agent.sac import SAC
 from acmr.config import SACConfig

@@ -1,19 +1,23 @@
 """Networks and log-probabilities against closed forms and PyTorch's own distributions."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from torch.distributions import AffineTransform, Independent, Normal, TanhTransform, TransformedDistribution
 
-from acmr.agent.networks import Dimensions, Networks, is_hidden, linear
+from acmr.agent.architecture import Architecture, Dimensions, is_hidden
+from acmr.agent.networks import Networks, linear
 
 DIMS = Dimensions(7, 3)
 LOW, HIGH = np.array([-0.4, -1.0, 0.0], np.float32), np.array([0.4, 1.0, 3.0], np.float32)
 
 
 def networks(seed: int = 0, **options) -> Networks:
-    return Networks(DIMS, [16, 12, 8], LOW, HIGH, torch.Generator().manual_seed(seed), **options)
+    architecture = replace(Architecture.plain(DIMS, [16, 12, 8], LOW, HIGH), **options)
+    return Networks(architecture, torch.Generator().manual_seed(seed))
 
 
 def test_log_prob_is_that_of_a_squashed_scaled_gaussian():
@@ -115,3 +119,27 @@ def test_only_layers_between_hidden_activations_are_hidden():
     assert [name for name in networks().layers() if is_hidden(name)] == [
         f"{part}.hidden_{index}" for part in ("actor", "critic_1", "critic_2") for index in (1, 2)
     ]
+
+
+@pytest.mark.parametrize("core", [None, Dimensions(9, 5)], ids=["plain", "adapted"])
+@pytest.mark.parametrize("sizes", [(6,), (16, 12, 8)], ids=str)
+def test_an_architecture_says_what_networks_have(core, sizes):
+    architecture = replace(Architecture.plain(DIMS, sizes, LOW, HIGH), core=core)
+    made = Networks(architecture, torch.Generator().manual_seed(0))
+    assert architecture.tensors == {name: tuple(tensor.shape) for name, tensor in made.state_dict().items()}
+    assert list(architecture.layers) == list(made.layers())
+    assert architecture.sizes == {name: layer.weight.numel() + len(layer.bias) for name, layer in made.layers().items()}
+    assert architecture.parameter_count == sum(parameter.numel() for parameter in made.parameters())
+    np.testing.assert_array_equal(made.actor.action_scale, (HIGH - LOW) / 2)
+    np.testing.assert_array_equal(made.actor.action_bias, (HIGH + LOW) / 2)
+
+
+def test_the_papers_networks_by_hand():
+    bounds = np.full(17, 0.4, np.float32)
+    plain = Architecture.plain(Dimensions(376, 17), (256, 256), -bounds, bounds)
+    actor = 377 * 256 + 257 * 256 + 2 * 257 * 17
+    critic = 394 * 256 + 257 * 256 + 257
+    assert plain.parameter_count == actor + 2 * critic
+    expanded = replace(plain, dims=Dimensions(270, 11), core=Dimensions(376, 17))
+    adapters = 271 * 376 + 2 * 18 * 11 + 2 * 282 * 393
+    assert expanded.parameter_count == plain.parameter_count + adapters

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.networks import Networks
 from acmr.agent.replay_buffer import Batch
 from acmr.agent.sac import METRIC_NAMES, SAC
 from acmr.config import SACConfig, TransferConfig
@@ -40,7 +41,7 @@ def make_agent(networks: Networks, config: SACConfig = CONFIG) -> SAC:
 
 
 def fresh(seed: int = 0, sizes: tuple[int, ...] = (16, 12)) -> Networks:
-    return Networks(DIMS, sizes, LOW, HIGH, generator(seed))
+    return Networks(Architecture.plain(DIMS, sizes, LOW, HIGH), generator(seed))
 
 
 def linear(params: dict, name: str, inputs: torch.Tensor) -> torch.Tensor:

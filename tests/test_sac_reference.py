@@ -7,8 +7,9 @@ import pytest
 import torch
 from reference_sac import ReferenceSAC
 
+from acmr.agent.architecture import Architecture, Dimensions
 from acmr.agent.kernels import arrays
-from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.networks import Networks
 from acmr.agent.precision import use_fast_float32
 from acmr.agent.replay_buffer import Batch
 from acmr.agent.sac import SAC
@@ -67,7 +68,7 @@ def make_batch(dims: Dimensions, seed: int, size: int) -> Batch:
 def make_networks(cell: str, sizes: tuple[int, ...], teacher_factory: Callable, activation: str = "relu") -> Networks:
     method, freeze, dims = CELLS[cell]
     high = np.full(dims.action, 0.4, np.float32)
-    fresh = Networks(dims, sizes, -high, high, generator(5))
+    fresh = Networks(Architecture.plain(dims, sizes, -high, high), generator(5))
     teacher = None if method == "none" else teacher_factory(SOURCE, sizes)
     config = TransferConfig(name=method, adapter_activation=activation)
     networks, _ = transfer(fresh, teacher, config, freeze, generator(6))
@@ -160,4 +161,5 @@ def test_every_cell_to_the_precision_of_float64(cell, teacher_factory):
 @pytest.mark.usefixtures("_double")
 def test_the_shape_of_the_paper_to_the_precision_of_float64():
     dims, high = Dimensions(376, 17), np.full(17, 0.4, np.float32)
-    assert_same_course(lambda: Networks(dims, (256, 256), -high, high, generator(5)), SACConfig(), updates=20)
+    architecture = Architecture.plain(dims, (256, 256), -high, high)
+    assert_same_course(lambda: Networks(architecture, generator(5)), SACConfig(), updates=20)

@@ -1,7 +1,8 @@
 """Each transfer copies exactly what the paper says, bit for bit, and refuses what does not fit."""
 
 import ast
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,14 @@ import pytest
 import torch
 import yaml
 
-from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.networks import Networks
 from acmr.config import ConfigError, TransferConfig, TransferRules, differing_keys
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.run_spec import specify
 from acmr.transfer import methods
 from acmr.transfer.methods import method, method_names, transfer
+from acmr.transfer.teacher import load_teacher
 
 SOURCE, TARGET = Dimensions(12, 5), Dimensions(8, 3)
 SIZES = (10, 9)
@@ -33,7 +36,7 @@ HIDDEN = ["actor.hidden_1", "critic_1.hidden_1", "critic_2.hidden_1"]
 
 def student(dims: Dimensions, sizes: tuple[int, ...] = SIZES, seed: int = 1) -> Networks:
     low, high = np.full(dims.action, -1, np.float32), np.full(dims.action, 1, np.float32)
-    return Networks(dims, sizes, low, high, torch.Generator().manual_seed(seed))
+    return Networks(Architecture.plain(dims, sizes, low, high), torch.Generator().manual_seed(seed))
 
 
 def settings(name: str) -> TransferConfig:
@@ -168,6 +171,14 @@ def test_the_published_runs_are_still_the_runs_that_their_settings_name(cell):
     for stored in (CONFIG_FOLDER.parent / "results" / "paper" / made.name).glob("seed_*/config.yaml"):
         settings = yaml.safe_load(stored.read_text())
         assert differing_keys(settings, replace(made.config, seed=settings["seed"])) == []
+
+
+def test_published_teachers_are_read_and_described_as_they_were():
+    for folder in (CONFIG_FOLDER.parent / "results" / "paper" / "humanoid-none").glob("seed_*"):
+        teacher = load_teacher(folder)
+        assert teacher.description.architecture.parameter_count == sum(map(torch.numel, teacher.tensors.values()))
+        stored = json.loads((folder / "teacher.json").read_text())
+        assert asdict(teacher.description) == {**asdict(teacher.description), **stored, "description_sha256": ""}
 
 
 def test_every_method_has_a_yaml_file_and_the_other_way_round():

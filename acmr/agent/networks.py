@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from acmr.agent.architecture import ACTOR, ADAPTERS, CRITICS, Architecture, Dimensions, Shape, is_hidden
+
 #: Bounds of the log standard deviation that the policy can express (reference implementation: CleanRL).
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
-_ADAPTERS = ("input_adapter", "mean_adapter", "log_std_adapter")
-
-
-@dataclass(frozen=True)
-class Dimensions:
-    """Sizes of an environment's observation and action vectors."""
-
-    observation: int
-    action: int
-
-    def __str__(self) -> str:
-        return f"{self.observation} sensors and {self.action} actuators"
 
 
 def linear(in_features: int, out_features: int, generator: torch.Generator) -> nn.Linear:
@@ -42,33 +31,26 @@ def linear(in_features: int, out_features: int, generator: torch.Generator) -> n
 
 
 class Trunk(nn.Module):
-    """Input layer and hidden layers, each followed by ReLU; before them, if asked for, an input adapter.
+    """Input layer and hidden layers, each followed by ReLU; before them, if there is one, an input adapter.
 
     Args:
-        inputs: Size of the vectors it is given.
-        core_inputs: Size that its first layer takes; another size than ``inputs`` is met by an adapter.
-        adapted: Whether there is an input adapter.
-        adapter_activation: ``relu`` or ``none``, applied to the adapter's output.
-        hidden_sizes: Width of each layer.
+        shapes: Inputs and outputs of each linear layer, those of the head included (:class:`Architecture`).
+        adapter_activation: ``relu`` or ``none``, applied to the input adapter's output.
         generator: Source of the initial weights.
     """
 
-    def __init__(
-        self,
-        inputs: int,
-        core_inputs: int,
-        adapted: bool,
-        adapter_activation: str,
-        hidden_sizes: Sequence[int],
-        generator: torch.Generator,
-    ) -> None:
+    input_adapter: nn.Linear | None
+    input: nn.Linear
+
+    def __init__(self, shapes: Mapping[str, Shape], adapter_activation: str, generator: torch.Generator) -> None:
         super().__init__()
-        self.input_adapter = linear(inputs, core_inputs, generator) if adapted else None
-        self.adapter_relu = adapter_activation == "relu"
-        self.input = linear(core_inputs, hidden_sizes[0], generator)
-        self.hidden_names = tuple(f"hidden_{index}" for index in range(1, len(hidden_sizes)))
-        for name, fan_in, fan_out in zip(self.hidden_names, hidden_sizes, hidden_sizes[1:], strict=False):
+        for name, (fan_in, fan_out) in shapes.items():
             self.add_module(name, linear(fan_in, fan_out, generator))
+        for name in ADAPTERS:
+            if name not in shapes:
+                self.register_module(name, None)
+        self.adapter_relu = adapter_activation == "relu"
+        self.hidden_names = tuple(name for name in shapes if is_hidden(name))
 
     def features(self, inputs: Tensor) -> Tensor:
         """Last hidden activations, (batch, hidden_sizes[-1]), of inputs (batch, inputs)."""
@@ -92,37 +74,22 @@ class Actor(Trunk):
     """Tanh-squashed Gaussian policy with a state-dependent standard deviation.
 
     Args:
-        dims: Observation and action sizes of the environment it acts in.
-        hidden_sizes: Width of each hidden layer.
-        action_low: Least value of each action, (action,).
-        action_high: Greatest value of each action, (action,).
+        architecture: Layers and bounds of the actions.
         generator: Source of the initial weights.
-        core: Sizes of a teacher's environment; given, the actor has the teacher's layers between adapters.
-        adapter_activation: ``relu`` or ``none``, between the input adapter and the teacher's first layer.
     """
 
     action_scale: Tensor
     action_bias: Tensor
+    mean: nn.Linear
+    log_std: nn.Linear
+    mean_adapter: nn.Linear | None
+    log_std_adapter: nn.Linear | None
 
-    def __init__(
-        self,
-        dims: Dimensions,
-        hidden_sizes: Sequence[int],
-        action_low: np.ndarray,
-        action_high: np.ndarray,
-        generator: torch.Generator,
-        core: Dimensions | None = None,
-        adapter_activation: str = "relu",
-    ) -> None:
-        inner = core or dims
-        super().__init__(
-            dims.observation, inner.observation, core is not None, adapter_activation, hidden_sizes, generator
-        )
-        self.mean = linear(hidden_sizes[-1], inner.action, generator)
-        self.log_std = linear(hidden_sizes[-1], inner.action, generator)
-        self.mean_adapter = linear(inner.action, dims.action, generator) if core else None
-        self.log_std_adapter = linear(inner.action, dims.action, generator) if core else None
-        low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (action_low, action_high))
+    def __init__(self, architecture: Architecture, generator: torch.Generator) -> None:
+        super().__init__(architecture.part(ACTOR), architecture.adapter_activation, generator)
+        bounds = (architecture.action_low, architecture.action_high)
+        low, high = (torch.tensor(bound, dtype=torch.float32) for bound in bounds)
+        # Not persistent: a teacher's file holds what was learned, and its description the bounds.
         self.register_buffer("action_scale", (high - low) / 2.0, persistent=False)
         self.register_buffer("action_bias", (high + low) / 2.0, persistent=False)
 
@@ -159,26 +126,18 @@ class Actor(Trunk):
 
 
 class Critic(Trunk):
-    """Soft action-value function; the arguments are those of :class:`Actor`."""
+    """Soft action-value function.
 
-    def __init__(
-        self,
-        dims: Dimensions,
-        hidden_sizes: Sequence[int],
-        generator: torch.Generator,
-        core: Dimensions | None = None,
-        adapter_activation: str = "relu",
-    ) -> None:
-        inner = core or dims
-        super().__init__(
-            dims.observation + dims.action,
-            inner.observation + inner.action,
-            core is not None,
-            adapter_activation,
-            hidden_sizes,
-            generator,
-        )
-        self.output = linear(hidden_sizes[-1], 1, generator)
+    Args:
+        architecture: Its layers.
+        name: Which of the critics it is.
+        generator: Source of the initial weights.
+    """
+
+    output: nn.Linear
+
+    def __init__(self, architecture: Architecture, name: str, generator: torch.Generator) -> None:
+        super().__init__(architecture.part(name), architecture.adapter_activation, generator)
 
     def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
         """Q(s, a), (batch,)."""
@@ -187,25 +146,23 @@ class Critic(Trunk):
 
 
 class Networks(nn.Module):
-    """All that SAC learns of an environment but its temperature: one actor and two independent critics."""
+    """All that SAC learns of an environment but its temperature: one actor and two independent critics.
 
-    def __init__(
-        self,
-        dims: Dimensions,
-        hidden_sizes: Sequence[int],
-        action_low: np.ndarray,
-        action_high: np.ndarray,
-        generator: torch.Generator,
-        core: Dimensions | None = None,
-        adapter_activation: str = "relu",
-    ) -> None:
+    Args:
+        architecture: Which layers they have.
+        generator: Source of the initial weights.
+    """
+
+    def __init__(self, architecture: Architecture, generator: torch.Generator) -> None:
         super().__init__()
-        self.dims, self.core, self.hidden_sizes = dims, core, tuple(hidden_sizes)
-        self.action_low, self.action_high = action_low, action_high
-        self.adapter_activation = adapter_activation
-        self.actor = Actor(dims, hidden_sizes, action_low, action_high, generator, core, adapter_activation)
-        self.critic_1 = Critic(dims, hidden_sizes, generator, core, adapter_activation)
-        self.critic_2 = Critic(dims, hidden_sizes, generator, core, adapter_activation)
+        self.architecture = architecture
+        self.actor = Actor(architecture, generator)
+        self.critic_1, self.critic_2 = (Critic(architecture, name, generator) for name in CRITICS)
+
+    @property
+    def dims(self) -> Dimensions:
+        """Observation and action sizes of the environment."""
+        return self.architecture.dims
 
     @property
     def critics(self) -> tuple[Critic, Critic]:
@@ -214,24 +171,8 @@ class Networks(nn.Module):
 
     def layers(self) -> dict[str, nn.Linear]:
         """Every linear layer by its name, such as ``actor.hidden_1`` or ``critic_2.output``."""
-        return {
-            f"{part}.{name}": layer
-            for part in ("actor", "critic_1", "critic_2")
-            for name, layer in getattr(self, part).layers()
-        }
+        return {f"{part}.{name}": layer for part in (ACTOR, *CRITICS) for name, layer in getattr(self, part).layers()}
 
     def with_core(self, core: Dimensions | None, adapter_activation: str, generator: torch.Generator) -> Networks:
         """Fresh networks for the same environment around the layers of another one."""
-        return Networks(
-            self.dims, self.hidden_sizes, self.action_low, self.action_high, generator, core, adapter_activation
-        )
-
-
-def is_hidden(layer: str) -> bool:
-    """Whether a layer lies between two hidden activations, so that no dimension of an environment touches it."""
-    return layer.split(".")[-1].startswith("hidden_")
-
-
-def is_adapter(layer: str) -> bool:
-    """Whether a layer translates between a student's dimensions and its teacher's."""
-    return layer.split(".")[-1] in _ADAPTERS
+        return Networks(replace(self.architecture, core=core, adapter_activation=adapter_activation), generator)

@@ -7,10 +7,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.networks import Networks
 from acmr.agent.replay_files import replay_bytes
 from acmr.config import ConfigError, ExperimentConfig
 from acmr.envs import EnvDescription, describe
@@ -48,8 +48,8 @@ def prepare(spec: RunSpec) -> Prepared:
     dims = Dimensions(len(about.observation_names), len(about.action_names))
     teacher = find_teacher(config, dims)
     streams = random_streams(config.seed, config.device)
-    low, high = np.array(about.action_low), np.array(about.action_high)
-    fresh = Networks(dims, config.agent.hidden_sizes, low, high, streams.networks)
+    architecture = Architecture(dims, tuple(config.agent.hidden_sizes), about.action_low, about.action_high)
+    fresh = Networks(architecture, streams.networks)
     networks, report = transfer(fresh, teacher, config.transfer, config.freeze, streams.networks)
     copied_alpha = teacher is not None and config.transfer.copy_log_alpha
     log_alpha = teacher.description.log_alpha if teacher is not None and copied_alpha else 0.0
@@ -95,12 +95,12 @@ def _check_device(device: str) -> None:
 
 def arrays_bytes(networks: Networks) -> int:
     """At most this much do the arrays of one checkpoint take: weights, targets, two moments each, and the rest."""
-    return 5 * 4 * sum(parameter.numel() for parameter in networks.parameters()) + (4 << 20)
+    return 5 * 4 * networks.architecture.parameter_count + (4 << 20)
 
 
 def space_needed(config: ExperimentConfig, networks: Networks) -> int:
     """Bytes that a run takes on the disk while it goes on."""
-    weights = 4 * sum(parameter.numel() for parameter in networks.parameters())
+    weights = 4 * networks.architecture.parameter_count
     if config.checkpoint_every == 0:
         return weights + _SMALL
     dims, agent = networks.dims, config.agent

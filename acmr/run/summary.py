@@ -76,7 +76,7 @@ def describe_teacher(
         agent: The learner at the end.
         summary: The content of ``summary.json``.
     """
-    networks = agent.networks
+    made = agent.networks.architecture
     return TeacherDescription(
         format_version=FORMAT_VERSION,
         environment=spec.config.env.name,
@@ -84,11 +84,11 @@ def describe_teacher(
         model_hash=about.model_hash,
         observation_names=list(about.observation_names),
         action_names=list(about.action_names),
-        action_low=networks.action_low.tolist(),
-        action_high=networks.action_high.tolist(),
-        hidden_sizes=list(networks.hidden_sizes),
-        core=[networks.core.observation, networks.core.action] if networks.core else None,
-        adapter_activation=networks.adapter_activation,
+        action_low=list(made.action_low),
+        action_high=list(made.action_high),
+        hidden_sizes=list(made.hidden_sizes),
+        core=[made.core.observation, made.core.action] if made.core else None,
+        adapter_activation=made.adapter_activation,
         log_alpha=agent.log_alpha.item(),
         seed=spec.config.seed,
         profile=spec.config.profile,

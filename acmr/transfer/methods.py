@@ -12,7 +12,8 @@ from typing import Any
 
 import torch
 
-from acmr.agent.networks import Dimensions, Networks, is_hidden
+from acmr.agent.architecture import Dimensions, is_hidden
+from acmr.agent.networks import Networks
 from acmr.config import ConfigError, TransferConfig
 from acmr.transfer.report import TransferReport, report_transfer
 from acmr.transfer.teacher import Teacher
@@ -89,9 +90,9 @@ def direct(
     student: Networks, teacher: Teacher, config: TransferConfig, generator: torch.Generator
 ) -> tuple[Networks, list[str]]:
     """All layers as they are, between environments of the same dimensions (experiment H1)."""
-    core = Dimensions(*teacher.description.core) if teacher.description.core else None
+    about = teacher.description.architecture
     # A teacher that was itself expanded hands on its adapters, too.
-    networks = student.with_core(core, teacher.description.adapter_activation, generator)
+    networks = student.with_core(about.core, about.adapter_activation, generator)
     return networks, _copy(networks, teacher, networks.layers())
 
 
@@ -138,11 +139,11 @@ def check_body(config: TransferConfig, owner: str, theirs: Dimensions, ours: Dim
 
 
 def _check_widths(config: TransferConfig, teacher: Teacher, student: Networks) -> None:
-    theirs = list(teacher.description.hidden_sizes)
-    if config.rules.same_widths and theirs != list(student.hidden_sizes):
+    theirs, ours = (list(each.architecture.hidden_sizes) for each in (teacher.description, student))
+    if config.rules.same_widths and theirs != ours:
         raise ConfigError(
             f"transfer={config.name}: the teacher {teacher.path} has hidden layers of {theirs}, the student of "
-            f"{list(student.hidden_sizes)}; type agent.hidden_sizes=[{','.join(map(str, theirs))}]"
+            f"{ours}; type agent.hidden_sizes=[{','.join(map(str, theirs))}]"
         )
 
 

@@ -56,16 +56,15 @@ def report_transfer(
         copied: Names of the layers that hold the teacher's values.
         frozen: Names of the layers that do not learn.
     """
-    layers = networks.layers()
-    fresh = [name for name in layers if name not in copied]
-    sizes = {name: sum(parameter.numel() for parameter in layer.parameters()) for name, layer in layers.items()}
+    sizes = networks.architecture.sizes
+    fresh = [name for name in sizes if name not in copied]
 
     def count(names: Iterable[str]) -> int:
         return sum(sizes[name] for name in names)
 
     parameters = {
-        "total": count(layers),
-        "trainable": count(layers) - count(frozen),
+        "total": count(sizes),
+        "trainable": count(sizes) - count(frozen),
         "copied": count(copied),
         "fresh": count(fresh),
         "frozen": count(frozen),

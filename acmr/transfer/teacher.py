@@ -10,18 +10,17 @@ import hashlib
 import json
 import math
 from dataclasses import asdict, dataclass, fields
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from acmr.agent.networks import Dimensions, Networks
+from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.networks import Networks
 from acmr.config import ACTIVATIONS, ConfigError
 from acmr.records import DESCRIPTION_FILE, TENSOR_FILE
 from acmr.storage.durable import write_bytes
@@ -83,6 +82,18 @@ class TeacherDescription:
         """Sizes of the environment it learned in."""
         return Dimensions(len(self.observation_names), len(self.action_names))
 
+    @property
+    def architecture(self) -> Architecture:
+        """The structure of its networks."""
+        return Architecture(
+            self.dims,
+            tuple(self.hidden_sizes),
+            tuple(self.action_low),
+            tuple(self.action_high),
+            Dimensions(*self.core) if self.core else None,
+            self.adapter_activation,
+        )
+
 
 @dataclass(frozen=True)
 class Teacher:
@@ -94,28 +105,9 @@ class Teacher:
 
     def build_networks(self) -> Networks:
         """The teacher's own networks, as they were when its training ended."""
-        about = self.description
-        networks = Networks(
-            about.dims,
-            about.hidden_sizes,
-            np.asarray(about.action_low, np.float32),
-            np.asarray(about.action_high, np.float32),
-            torch.Generator().manual_seed(0),
-            Dimensions(*about.core) if about.core else None,
-            about.adapter_activation,
-        )
-        try:
-            networks.load_state_dict(self.tensors)
-        except RuntimeError as error:
-            raise self.misfit() from error
+        networks = Networks(self.description.architecture, torch.Generator().manual_seed(0))
+        networks.load_state_dict(self.tensors)
         return networks
-
-    def misfit(self) -> ConfigError:
-        """The error of a teacher whose two files do not belong together."""
-        return ConfigError(
-            f"{self.path}: the tensors do not fit the layers that {DESCRIPTION_FILE} describes; "
-            "the two files are not of one run"
-        )
 
 
 def save_teacher(folder: Path, networks: Networks, description: TeacherDescription) -> None:
@@ -166,12 +158,13 @@ def load_teacher(path: str | Path) -> Teacher:
         tensors = load_tensors(data)
     except (SafetensorError, KeyError, ValueError) as error:
         raise ConfigError(f"{path}: not a safetensors file ({error})") from error
-    teacher = Teacher(path, description, tensors)
-    # Before anything of the size that the description claims is made.
-    if sum(tensor.numel() for tensor in tensors.values()) != _parameter_count(description):
-        raise teacher.misfit()
-    teacher.build_networks()
-    return teacher
+    # Compared as shapes, before anything of the size that the description claims is made.
+    if {name: tuple(tensor.shape) for name, tensor in tensors.items()} != description.architecture.tensors:
+        raise ConfigError(
+            f"{path}: the tensors do not fit the layers that {DESCRIPTION_FILE} describes; "
+            "the two files are not of one run"
+        )
+    return Teacher(path, description, tensors)
 
 
 def _read_description(path: Path) -> TeacherDescription:
@@ -233,19 +226,3 @@ def _wrong_entries(about: TeacherDescription) -> list[str]:
         **{name: isinstance(getattr(about, name), str) for name in texts},
     }
     return [name for name, is_good in good.items() if not is_good]
-
-
-def _parameter_count(about: TeacherDescription) -> int:
-    """Numbers in the networks that a description describes."""
-    dims, inner = about.dims, Dimensions(*about.core) if about.core else about.dims
-
-    def trunk(given: int, taken: int) -> int:
-        widths = [taken, *about.hidden_sizes]
-        adapter = (given + 1) * taken if about.core else 0
-        return adapter + sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths))
-
-    last = about.hidden_sizes[-1] + 1
-    actor = trunk(dims.observation, inner.observation) + 2 * last * inner.action
-    if about.core:
-        actor += 2 * (inner.action + 1) * dims.action
-    return actor + 2 * (trunk(dims.observation + dims.action, inner.observation + inner.action) + last)
