@@ -44,17 +44,6 @@ METRIC_COLUMNS = ("global_step", "steps_per_second")
 #: What an environment's ``info`` calls its forward velocity, in m/s.
 VELOCITY_KEY = "x_velocity"
 
-#: The paper's experiments: (role of the environment, transfer, freeze) of each (paper, table 2).
-CELLS: dict[str, tuple[str, str, bool]] = {
-    "H0": ("source", "none", False),
-    "H1": ("source", "direct", False),
-    "A0": ("target", "none", False),
-    "A1": ("target", "hidden", False),
-    "A2": ("target", "hidden", True),
-    "A3": ("target", "expand", False),
-    "A4": ("target", "expand", True),
-}
-
 
 class DamagedError(Exception):
     """A file of a run does not hold what was written to it. The message says which file and what is wrong."""

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from acmr.records import CELLS, SUMMARY_FILE
+from acmr.cells import REFERENCE
+from acmr.records import SUMMARY_FILE
 from analysis.loading.load import InputError, RunSet
 from analysis.loading.missing import Missing, missing_runs, planned_seeds
 from analysis.statistics.comparisons import check_reference, compare_cells, compare_groups
@@ -47,8 +48,8 @@ class Analysis:
 
     @property
     def planned_runs(self) -> int:
-        """Runs of the whole matrix."""
-        return len(CELLS) * self.planned
+        """Runs that there should be: every cell with every seed."""
+        return len(self.data.cells) * self.planned
 
     @property
     def comparisons(self) -> pd.DataFrame:
@@ -57,7 +58,7 @@ class Analysis:
 
 
 def analyze(
-    data: RunSet, threshold: float | None = None, consecutive: int | None = None, reference: str = "A0"
+    data: RunSet, threshold: float | None = None, consecutive: int | None = None, reference: str = REFERENCE
 ) -> Analysis:
     """All numbers of a set of runs.
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from acmr.cells import REFERENCE
 from analysis import FORMATS
 
 
@@ -64,9 +65,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--reference",
-        default="A0",
+        default=REFERENCE,
         metavar="CELL",
-        help="cell or group that the others are compared with (default: A0)",
+        help=f"cell or group that the others are compared with (default: {REFERENCE})",
     )
     parser.add_argument(
         "--format", type=_formats, metavar="LIST", default=FORMATS, help="file formats of the figures: pdf,png,svg"

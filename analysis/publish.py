@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from acmr.cells import CELLS
 from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
@@ -83,7 +84,8 @@ def _files(run: Path) -> dict[str, bytes]:
 
 
 def _teaches(summary: dict[str, Any]) -> bool:
-    return summary.get("cell") == "H0" and summary["status"] == COMPLETE
+    cell = CELLS.get(str(summary.get("cell")))
+    return cell is not None and cell.teaches and summary["status"] == COMPLETE
 
 
 def _packed(path: Path) -> tuple[str, bytes]:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from acmr.records import CELLS
+from acmr.cells import CELLS, TARGET, planned_cells, run_name
 from analysis.loading.load import load
 from analysis.statistics.metrics import measure
 
@@ -27,9 +27,9 @@ TERMS = ("reward_forward", "reward_survive", "reward_ctrl")
 
 def write_run(root: Path, cell: str, seed: int, episodes: int, total: int, rng: np.random.Generator) -> None:
     """One run directory of a paper run's size: short episodes first, 1,000 steps at the end."""
-    role, transfer, freeze = CELLS[cell]
-    env = "humanoid" if role == "source" else "armless_humanoid"
-    directory = root / (f"{env}-{transfer}" + ("-frozen" if freeze else "")) / f"seed_{seed}"
+    row = CELLS[cell]
+    env, transfer, freeze = "armless_humanoid" if row.role == TARGET else "humanoid", row.transfer, row.freeze
+    directory = root / run_name(env, transfer, freeze, {}) / f"seed_{seed}"
     directory.mkdir(parents=True)
     growth = np.linspace(0.02, 1, episodes) ** 1.5
     lengths = np.maximum(1, growth / growth.sum() * total).astype(int)
@@ -55,7 +55,7 @@ def write_run(root: Path, cell: str, seed: int, episodes: int, total: int, rng: 
 def bench_load(folder: Path, runs: int, episodes: int) -> tuple[float, float]:
     """Wall-clock and CPU seconds of loading many runs and computing their metrics."""
     rng = np.random.default_rng(0)
-    cells = list(CELLS)
+    cells = [cell.name for cell in planned_cells([])]
     for number in range(runs):
         write_run(folder, cells[number % len(cells)], number // len(cells), episodes, 1_000_000, rng)
     wall, cpu = time.perf_counter(), time.process_time()
@@ -68,9 +68,9 @@ def bench_load(folder: Path, runs: int, episodes: int) -> tuple[float, float]:
 def bench_results(folder: Path, episodes: int) -> float:
     """Wall-clock seconds of the whole command on the paper's 21 runs, figures 2 and 3 included."""
     rng = np.random.default_rng(0)
-    for cell in CELLS:
+    for cell in planned_cells([]):
         for seed in (1, 2, 3):
-            write_run(folder / "runs", cell, seed, episodes, 1_000_000, rng)
+            write_run(folder / "runs", cell.name, seed, episodes, 1_000_000, rng)
     command = [sys.executable, "-m", "analysis", str(folder / "runs"), "--out", str(folder / "out")]
     start = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from acmr.cells import full_name
 from acmr.config import THRESHOLD, ExperimentConfig
 from acmr.envs import describe
 from acmr.records import COMPLETE, RUN_PATTERN, SUMMARY_FILE
 from acmr.storage.json_files import read_json
 from sweeps.plan import Plan, PlannedRun
-from sweeps.view import Lengths, full_name
+from sweeps.view import Lengths
 
 #: Memory of a training beside its replay buffer: Python, torch and MuJoCo (measured, 64-bit Linux, CPU).
 _BASE_MEMORY = 450e6

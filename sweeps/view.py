@@ -5,7 +5,6 @@ Imports nothing heavy.
 
 from __future__ import annotations
 
-import re
 import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from acmr.cells import full_name, stops
 from acmr.records import COMPLETE, DIVERGED, ENDED, RUNNING, STOPPED, SUMMARY_FILE
 from acmr.storage.json_files import read_json
 from acmr.storage.processes import is_alive
@@ -23,8 +23,6 @@ from sweeps.folder import FAILED, FINAL, WAITING, State, SweepRun
 #: A run that says it is running, but whose process is gone or has said nothing for so many seconds.
 LOST, SILENCE = "lost", 600.0
 BLOCKED = "blocked"
-#: How a run's name spells that it stops at its threshold (``acmr.settings.run_spec``).
-_STOP = re.compile(r"-stop=threshold(-stop_after=\d+)?(?=-|$)")
 _HEADER = ["run", "seed", "state", "step", "steps/s", "ETA", "return", ""]
 _LEFT = ("run", "state", "")
 _COLORS = {COMPLETE: "green", DIVERGED: "magenta", FAILED: "red", RUNNING: "cyan", LOST: "red", BLOCKED: "red"}
@@ -145,16 +143,6 @@ def counts(views: Iterable[RunStatus]) -> str:
         numbers[view.state] = numbers.get(view.state, 0) + 1
     order = (COMPLETE, DIVERGED, RUNNING, WAITING, STOPPED, LOST, BLOCKED, FAILED)
     return ", ".join(f"{numbers[state]} {state}" for state in order if state in numbers) or "no runs"
-
-
-def stops(name: str) -> bool:
-    """Whether the run of this name ends once it has met its threshold."""
-    return _STOP.search(name) is not None
-
-
-def full_name(name: str) -> str:
-    """The name of the run that takes all steps, of which the run of this name is the beginning or the whole."""
-    return _STOP.sub("", name)
 
 
 class Lengths:

@@ -5,39 +5,45 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from acmr.records import CELLS
+from acmr.cells import CELLS, TARGET, run_name
 
 PAIRS = {"paper": ("humanoid", "armless_humanoid"), "quick": ("ant", "ant_three_legs")}
 HEADER = "global_step,episodic_return,episode_length,mean_forward_velocity,reward_forward,reward_survive"
 
 
 def run_directory(root: Path, cell: str, seed: int, profile: str = "paper") -> Path:
-    role, transfer, freeze = CELLS[cell]
-    env = PAIRS[profile][role == "target"]
-    return root / (f"{env}-{transfer}" + ("-frozen" if freeze else "")) / f"seed_{seed}"
+    row = CELLS[cell]
+    env = PAIRS[profile][row.role == TARGET]
+    return root / run_name(env, row.transfer, row.freeze, row.changes) / f"seed_{seed}"
 
 
 def settings(cell: str, seed: int, profile: str, total: int, threshold: float) -> dict:
-    role, transfer, freeze = CELLS[cell]
+    row = CELLS[cell]
     source, target = PAIRS[profile]
-    return {
+    stored: dict = {
         "seed": seed,
-        "freeze": freeze,
+        "freeze": row.freeze,
         "total_timesteps": total,
         "threshold": threshold,
         "consecutive": 5,
         "threads": 1,
         "profile": profile,
         "pair": {"source": source, "target": target},
-        "env": {"name": source if role == "source" else target, "id": "Humanoid-v4"},
+        "env": {"name": target if row.role == TARGET else source, "id": "Humanoid-v4"},
         "agent": {"q_lr": 0.001, "learning_starts": total // 200, "hidden_sizes": [256, 256]},
-        "transfer": {"name": transfer, "teacher": None},
+        "transfer": {"name": row.transfer, "teacher": None},
     }
+    for key, value in row.changes.items():
+        *groups, leaf = key.split(".")
+        reduce(getitem, groups, stored)[leaf] = value
+    return stored
 
 
 def rows_reaching(steps: float | None, total: int, threshold: float = 4900.0, length: int = 100) -> np.ndarray:
@@ -109,13 +115,12 @@ def write_run(
     (directory / "metrics.csv").write_text(metrics_text(total, 110.0 + seed))
     (directory / "run.log").write_text("started\n")
     if summary is not False:
-        _, transfer, freeze = CELLS[cell]
         content = {
             "status": "complete",
             "cell": cell,
             "env": config["env"]["name"],
-            "transfer": transfer,
-            "freeze": freeze,
+            "transfer": config["transfer"]["name"],
+            "freeze": config["freeze"],
             "seed": seed,
             "profile": profile,
             "run": directory.parent.name,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from analysis_runs import rows_reaching, write_run
 
-from acmr.records import CELLS
+from acmr.cells import CELLS
 from analysis import FORMATS
 from analysis.cli import main
 from analysis.figures import stills
@@ -166,6 +166,15 @@ def test_settings_that_differ_are_found(tmp_path):
         "threads": {"A0": "1", "A2": "1 (seed 1); 8 (seed 2)"},
         "git_commit": {"A0": "def", "A2": "abc"},
     }
+
+
+def test_a_setting_that_some_runs_were_made_before_is_found(tmp_path):
+    write_run(tmp_path, "A0", 1, rows_reaching(6000, 20_000), total=20_000)
+    env = {"name": "armless_humanoid", "id": "Humanoid-v4", "kwargs": {"healthy_reward": 2.0}}
+    write_run(tmp_path, "A2", 1, rows_reaching(6000, 20_000), total=20_000, stop="threshold", env=env)
+    defining, differing = setting_differences(load(tmp_path))
+    assert defining.set_index("setting").loc["env.kwargs.healthy_reward"].to_dict() == {"A0": "not set", "A2": "2.0"}
+    assert differing.to_dict("records") == [{"setting": "stop", "A0": "horizon", "A2": "threshold"}]
 
 
 def test_any_part_of_the_matrix_makes_a_report(tmp_path, monkeypatch, capsys):

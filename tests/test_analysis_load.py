@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from analysis_runs import HEADER, PAIRS, csv_text, rows_reaching, run_directory, write_matrix, write_run
 
-from acmr.records import CELLS
+from acmr.cells import CELLS
 from analysis.loading.load import InputError, RunSet, load
 from analysis.loading.missing import missing_runs
 

@@ -13,6 +13,8 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("acmr", "analysis", "sweeps")
 #: Modules of one package; a longer list is no map.
 MOST_MODULES = 10
+#: Modules of ours that one of the analysis may import; what knows more than that should be told the rest.
+MOST_IMPORTS = 15
 #: Packages that may know Hydra; below them settings are plain dataclasses.
 HYDRA_BORDER = ("acmr/settings", "sweeps")
 #: Importing these takes seconds, and reading results needs none of them.
@@ -131,6 +133,11 @@ def test_no_package_has_too_many_modules():
     for package in {path.parent for path in MODULES.values()}:
         count = len([path for path in package.glob("*.py") if not path.name.startswith("__")])
         assert count <= MOST_MODULES, f"{names(package)}: {count} modules"
+
+
+@pytest.mark.parametrize("path", sources("analysis"), ids=names)
+def test_no_module_imports_too_many(path):
+    assert len(imports(path) & MODULES.keys()) <= MOST_IMPORTS
 
 
 @pytest.mark.parametrize("path", sources(*PACKAGES, "tests", "bench"), ids=names)

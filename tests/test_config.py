@@ -11,8 +11,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from acmr.cells import CELLS
 from acmr.config import NEUTRAL_KEYS, SACConfig, differing_keys, flatten, plain_settings, schema_defaults
-from acmr.records import CELLS
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.errors import USER_ERRORS, check_booleans, explain
 from acmr.settings.run_spec import specify, teacher_spec
@@ -50,13 +50,13 @@ def test_every_leaf_of_every_group_composes(leaf):
 
 
 @pytest.mark.parametrize(("profile", "cell"), [*itertools.product(["paper", "quick", "paper_v5"], CELLS)])
-def test_cells_are_those_of_the_paper(profile, cell):
+def test_a_cell_is_what_its_file_says(profile, cell):
     made = spec(f"experiment={cell}", f"profile={profile}")
-    role, transfer, freeze = CELLS[cell]
+    row = CELLS[cell]
     assert made.cell == cell
-    assert made.config.env.name == getattr(made.config.pair, role)
-    assert (made.config.transfer.name, made.config.freeze) == (transfer, freeze)
-    assert made.changes == {}
+    assert made.config.env.name == getattr(made.config.pair, row.role)
+    assert (made.config.transfer.name, made.config.freeze) == (row.transfer, row.freeze)
+    assert made.changes == row.changes
 
 
 def test_paper_profile_has_the_papers_values():

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from acmr.cells import full_name, stops
 from acmr.config import ExperimentConfig
 from acmr.records import RUNNING
 from acmr.settings.compose import compose_config, parse
@@ -17,7 +18,7 @@ from sweeps.folder import WAITING
 from sweeps.plan import Plan, expand, make_plan
 from sweeps.status import main
 from sweeps.sweeper import entries_of
-from sweeps.view import Lengths, RunStatus, full_name, steps_ahead, stops, table, view_run
+from sweeps.view import Lengths, RunStatus, steps_ahead, table, view_run
 
 PUBLISHED = Path(__file__).resolve().parent.parent / "results" / "paper"
 CELLS = ("H0", "H1", "A0", "A1", "A2", "A3", "A4")

@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.config import (
-    HORIZON,
-    STOP_KEYS,
-    TEACHER_KEYS,
-    ConfigError,
-    ExperimentConfig,
-    flatten,
-    is_neutral,
-    plain_settings,
-)
-from acmr.records import CELLS, DESCRIPTION_FILE
+from acmr.cells import SOURCE, TARGET, cell_of, digest, run_name
+from acmr.config import HORIZON, TEACHER_KEYS, ConfigError, ExperimentConfig, flatten, is_neutral, plain_settings
+from acmr.records import DESCRIPTION_FILE
 from acmr.settings.compose import as_override, baseline, compose_config, env_overrides, parse
 
 #: Settings that a run's name spells out in its own way.
 _NAMED_KEYS = ("seed", "freeze", "transfer.name", "transfer.teacher", "env.name")
 #: What stands in a method's file only.
 _RULES = "transfer.rules."
-_MAX_NAME = 120
-_PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,32}")
 
 
 @dataclass(frozen=True)
@@ -38,7 +26,7 @@ class RunSpec:
         config: All settings.
         changes: Those that change the result and differ from the profile's own.
         name: Directory name, ``<env>-<transfer>[-frozen][-<key>=<value>...]``.
-        cell: The paper's name of the experiment, if the run is one of its experiments, or the beginning of one.
+        cell: The cell (:mod:`acmr.cells`) that the run belongs to, or is the beginning of, if there is one.
     """
 
     config: ExperimentConfig
@@ -65,25 +53,12 @@ class RunSpec:
 def specify(config: ExperimentConfig) -> RunSpec:
     """Finds out which run the settings mean."""
     changes = _changes(config)
-    parts = [_safe(config.env.name), config.transfer.name]
-    if config.freeze:
-        parts.append("frozen")
-    shown = {key.split(".")[-1]: value for key, value in changes.items()}
+    shown = dict(changes)
     if config.transfer.teacher is not None:
-        shown["teacher"] = _teacher_mark(config.transfer.teacher)
-    suffix = [f"{key}={_short(value)}" for key, value in sorted(shown.items())]
-    name = "-".join([*parts, *suffix])
-    if len(name) > _MAX_NAME:
-        name = "-".join([*parts, _digest(suffix)])
-    cell = cell_of(config) if set(shown) <= set(STOP_KEYS) else None
-    return RunSpec(config, changes, name, cell)
-
-
-def cell_of(config: ExperimentConfig) -> str | None:
-    """The paper's experiment with this environment, transfer and freezing, if there is one."""
-    roles = {config.pair.source: "source", config.pair.target: "target"}
-    key = (roles.get(config.env.name), config.transfer.name, config.freeze)
-    return next((cell for cell, cell_key in CELLS.items() if cell_key == key), None)
+        shown["transfer.teacher"] = _teacher_mark(config.transfer.teacher)
+    kind = (config.transfer.name, config.freeze, shown)
+    role = {config.pair.source: SOURCE, config.pair.target: TARGET}.get(config.env.name)
+    return RunSpec(config, changes, run_name(config.env.name, *kind), cell_of(role, *kind))
 
 
 def teacher_spec(config: ExperimentConfig) -> RunSpec:
@@ -145,20 +120,4 @@ def _teacher_mark(path: str) -> str:
         return str(json.loads(beside.read_text(encoding="utf-8"))["sha256"])[:8]
     except (OSError, ValueError, KeyError, TypeError):
         # Loading the teacher will say what is wrong with it; until then its path identifies it.
-        return _digest(path)
-
-
-def _short(value: object) -> str:
-    if isinstance(value, list | tuple):
-        text = "+".join(_short(entry) for entry in value) if value else "none"
-    else:
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-    return text if _PLAIN.fullmatch(text) else _digest(value)
-
-
-def _safe(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_.-]", "_", name)
-
-
-def _digest(value: object) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:8]
+        return digest(path)

@@ -15,8 +15,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from acmr.cells import CELLS
 from acmr.config import THRESHOLD, TrackingConfig, TransferConfig
-from acmr.records import CELLS, VELOCITY_COLUMN, EpisodeRecord
+from acmr.records import VELOCITY_COLUMN, EpisodeRecord
 from acmr.text import one_line
 from acmr.tracking import wandb_backend
 from acmr.tracking.wandb_backend import LONGEST, SERVER_WAIT

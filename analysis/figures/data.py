@@ -11,7 +11,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from acmr.records import CELLS, COMPLETE, VELOCITY_COLUMN
+from acmr.cells import CELLS
+from acmr.records import COMPLETE, VELOCITY_COLUMN
 from analysis.figures.style import Palette
 from analysis.loading.read_run import FOREIGN, UNFINISHED
 from analysis.loading.speed import read_speed

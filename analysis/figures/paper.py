@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
+from acmr.cells import CELLS, SOURCE, TARGET
 from analysis.figures import rows, steps
 from analysis.figures.data import Draw, FigureData, FigureSpec, mean_curve
 from analysis.figures.parts import count_label, marker_style, short_steps, step_axis
@@ -21,6 +22,8 @@ from analysis.figures.style import COLUMN, PALETTES, Palette
 
 
 def _paper_figure(cells: tuple[str, ...], override: dict[str, str] | None = None) -> Draw:
+    """One of figures 4 to 6: the learning curves of these cells; ``override`` names colors that differ there."""
+
     def draw(data: FigureData, palette: Palette) -> Figure | None:
         present = data.present(cells)
         if not present:
@@ -70,20 +73,32 @@ def _curve(axes: Axes, data: FigureData, palette: Palette, cell: str, color: obj
     return axes.plot(steps, values, color=color, label=label, zorder=3, **style)[0]
 
 
+#: The paper draws the first two curves of every figure in these, whatever color a cell has elsewhere.
+_FIRST_COLORS = ("blue", "orange")
 _HOW = (
     "Rolling averages over {window} episodes, averaged over the seeds; behind them the raw returns of the first seed "
     "(seed 1 unless it is missing); black: threshold; dashed: mean steps to threshold from the raw returns (StT; where "
     "a seed never reached it, how many did)."
 )
 
+#: What the paper's cells are compared with, and the cells of each environment.
+_BASELINES = tuple(dict.fromkeys(cell.baseline for cell in CELLS.values() if cell.published and cell.baseline))
+_SOURCE, _TARGET = (tuple(cell.name for cell in CELLS.values() if cell.role == role) for role in (SOURCE, TARGET))
+_OWN = [name for name in _TARGET if not CELLS[name].published]
+
 FIGURES = (
-    FigureSpec("figure_4", "Figure 4", f"Baselines A0 and H0. {_HOW}", _paper_figure(("A0", "H0"), {"H0": "orange"})),
-    FigureSpec("figure_5", "Figure 5", f"A0 to A4. {_HOW}", _paper_figure(("A0", "A1", "A2", "A3", "A4"))),
+    FigureSpec(
+        "figure_4",
+        "Figure 4",
+        f"Baselines {' and '.join(_BASELINES)}. {_HOW}",
+        _paper_figure(_BASELINES, dict(zip(_BASELINES, _FIRST_COLORS, strict=False))),
+    ),
+    FigureSpec("figure_5", "Figure 5", f"{', '.join(['A0 to A4', *_OWN])}. {_HOW}", _paper_figure(_TARGET)),
     FigureSpec(
         "figure_6",
         "Figure 6",
-        f"Proof of concept: H0 and H1. {_HOW}",
-        _paper_figure(("H0", "H1"), {"H0": "blue", "H1": "orange"}),
+        f"Proof of concept: {' and '.join(_SOURCE)}. {_HOW}",
+        _paper_figure(_SOURCE, dict(zip(_SOURCE, _FIRST_COLORS, strict=False))),
     ),
     *steps.FIGURES,
     *rows.FIGURES,

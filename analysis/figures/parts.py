@@ -12,7 +12,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from acmr.records import CELLS
+from acmr.cells import CELLS, SOURCE, TARGET
 from analysis.figures.data import MOST_OTHERS, POINTS, FigureData
 from analysis.figures.style import COLUMN, Palette
 
@@ -70,8 +70,8 @@ def marker_style(palette: Palette, group: str, groups: Sequence[str]) -> dict[st
 def stacked(groups: list[str]) -> tuple[Figure, list[tuple[Axes, list[str]]]]:
     """One panel for the target's cells, one for the source's, one for other groups, as far as they are there."""
     kinds = [
-        [group for group in groups if group in CELLS and CELLS[group][0] == "target"],
-        [group for group in groups if group in CELLS and CELLS[group][0] == "source"],
+        [group for group in groups if group in CELLS and CELLS[group].role == TARGET],
+        [group for group in groups if group in CELLS and CELLS[group].role == SOURCE],
         [group for group in groups if group not in CELLS][:MOST_OTHERS],
     ]
     filled = [kind for kind in kinds if kind]

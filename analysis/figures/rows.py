@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from acmr.records import CELLS
+from acmr.cells import CELLS
 from analysis.figures.data import MOST_OTHERS, FigureData, FigureSpec
 from analysis.figures.parts import (
     ROW,

@@ -8,7 +8,8 @@ import seaborn as sns
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from acmr.records import CELLS, VELOCITY_COLUMN
+from acmr.cells import CELLS
+from acmr.records import VELOCITY_COLUMN
 from analysis.figures.data import MOST_OTHERS, FigureData, FigureSpec, mean_curve
 from analysis.figures.parts import count_label, finish, marker_style, stacked, step_axis, two_lines
 from analysis.figures.style import COLUMN, Palette

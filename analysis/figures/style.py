@@ -9,11 +9,14 @@ from typing import Any
 import matplotlib as mpl
 import seaborn as sns
 
+from acmr.cells import CELLS
+
 #: Width of a column of a two-column paper, inches.
 COLUMN = 3.4
 
-_TAB = {name: f"tab:{name}" for name in ("blue", "orange", "green", "red", "purple", "brown", "cyan")}
-#: Okabe and Ito's colors, which stay apart for people with color vision deficiency.
+_NAMES = ("blue", "orange", "green", "red", "purple", "brown", "cyan", "pink", "olive", "gray")
+_TAB = {name: f"tab:{name}" for name in _NAMES}
+#: Okabe and Ito's colors, which stay apart for people with color vision deficiency, and three of Tol's beside them.
 _SAFE = {
     "blue": "#0072B2",
     "orange": "#E69F00",
@@ -22,9 +25,10 @@ _SAFE = {
     "purple": "#CC79A7",
     "brown": "#56B4E9",
     "cyan": "#4D4D4D",
+    "pink": "#882255",
+    "olive": "#999933",
+    "gray": "#BBBBBB",
 }
-_CELLS = {"A0": "blue", "A1": "orange", "A2": "green", "A3": "red", "A4": "purple", "H0": "brown", "H1": "cyan"}
-_MARKERS = dict(zip(("A0", "A1", "A2", "A3", "A4", "H0", "H1"), "os^DvPX", strict=True))
 _OTHER_MARKERS = "<>ph*d8H"
 
 
@@ -48,17 +52,17 @@ class Palette:
             groups: All groups, so that those that are no cells get colors of their own.
             override: Names of colors that differ in this figure, by cell.
         """
-        name = (override or {}).get(group) or _CELLS.get(group)
-        if name is not None:
-            return (_SAFE if self.markers else _TAB)[name]
-        others = [other for other in groups if other not in _CELLS]
+        if group in CELLS:
+            name = (override or {}).get(group, CELLS[group].color)
+            return (_SAFE if self.markers else _TAB).get(name, name)
+        others = [other for other in groups if other not in CELLS]
         return sns.husl_palette(len(others), l=0.5)[others.index(group)]
 
     def marker(self, group: str, groups: Sequence[str]) -> str:
         """Marker of a group."""
-        if group in _MARKERS:
-            return _MARKERS[group]
-        others = [other for other in groups if other not in _CELLS]
+        if group in CELLS:
+            return CELLS[group].marker
+        others = [other for other in groups if other not in CELLS]
         return _OTHER_MARKERS[others.index(group) % len(_OTHER_MARKERS)]
 
 

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.records import CELLS, SEED_FOLDER
+from acmr.cells import CELLS, SOURCE, Cell, full_name, run_name
+from acmr.config import flatten
+from acmr.records import SEED_FOLDER
 
 #: (source, target) environments of the profiles, for runs of which only the directory's name is left.
 PAIRS = (
@@ -23,7 +25,7 @@ class Identity:
 
     Attributes:
         group: Name of the runs that differ only in their seed: the cell's, or else the directory's.
-        cell: One of ``CELLS``; None for other groups.
+        cell: One of ``acmr.cells.CELLS``; None for other groups.
         seed: None where neither the directory nor its files say.
         profile: None for foreign runs.
     """
@@ -46,56 +48,57 @@ def identify(directory: Path, name: str, config: Mapping[str, Any], summary: Map
         config: Contents of ``config.yaml``; empty if there is none.
         summary: Contents of ``summary.json``; empty if there is none.
     """
-    env, transfer = _mapping(config, "env").get("name"), _mapping(config, "transfer").get("name")
-    env, transfer = summary.get("env", env), summary.get("transfer", transfer)
-    freeze = summary.get("freeze", config.get("freeze"))
-    if "cell" in summary:
-        cell = summary["cell"] if summary["cell"] in CELLS else None
+    settings = flatten(config)
+    env, transfer = (summary.get(key, settings.get(f"{key}.name")) for key in ("env", "transfer"))
+    freeze = summary.get("freeze", settings.get("freeze"))
+    told = CELLS.get(_text(summary.get("cell")) or "")
+    if told and (not config or _fits(told, settings)):
+        cell: str | None = told.name
     elif config:
-        cell = _cell_of(config, name)
+        cell = _cell_of(settings, name)
     else:
-        cell = dict(_names()).get(name) or (name.upper() if name.upper() in CELLS else None)
+        cell = dict(_names()).get(full_name(name).lower())
     match = SEED_FOLDER.fullmatch(directory.name)
-    seed = summary.get("seed", config.get("seed", int(match.group(1)) if match else None))
+    seed = summary.get("seed", settings.get("seed", int(match.group(1)) if match else None))
     return Identity(
         group=cell or name,
         cell=cell,
         seed=seed if isinstance(seed, int) else None,
-        profile=_text(summary.get("profile", config.get("profile"))),
+        profile=_text(summary.get("profile", settings.get("profile"))),
         env=_text(env),
         transfer=_text(transfer),
         freeze=freeze if isinstance(freeze, bool) else None,
     )
 
 
-def run_name(env: str, transfer: str, freeze: bool) -> str:
-    """The directory's name of a run whose other settings are its profile's."""
-    return f"{env}-{transfer}" + ("-frozen" if freeze else "")
+def _cell_of(settings: Mapping[str, Any], name: str) -> str | None:
+    """The cell with a run's settings, as far as the directory's name says nothing else.
 
-
-def _cell_of(config: Mapping[str, Any], name: str) -> str | None:
-    pair = _mapping(config, "pair")
-    environments = {"source": pair.get("source"), "target": pair.get("target")}
-    env, transfer, freeze = (_mapping(config, "env").get("name"), _mapping(config, "transfer").get("name"), False)
-    freeze = bool(config.get("freeze"))
-    # A setting that differs from the profile's is part of the directory's name: then it is no cell of the paper.
-    if Path(name).name not in (run_name(str(env), str(transfer), freeze), *CELLS):
-        return None
-    for cell, (role, method, frozen) in CELLS.items():
-        if (environments[role], method, frozen) == (env, transfer, freeze):
-            return cell
+    Settings that differ from the profile's are part of the name, and the profile itself is not at hand.
+    """
+    env, transfer, freeze = settings.get("env.name"), settings.get("transfer.name"), bool(settings.get("freeze"))
+    own = full_name(Path(name).name)
+    # Of two cells that a directory by a mere cell's name could hold, the one that asks for more.
+    for cell in sorted(CELLS.values(), key=lambda cell: -len(cell.changes)):
+        meant = (settings.get(f"pair.{cell.role}"), cell.transfer, cell.freeze)
+        names = (*CELLS, run_name(str(env), cell.transfer, cell.freeze, cell.changes))
+        if meant == (env, transfer, freeze) and _fits(cell, settings) and own in names:
+            return cell.name
     return None
 
 
+def _fits(cell: Cell, settings: Mapping[str, Any]) -> bool:
+    """Whether settings have all that a cell changes."""
+    return all(settings.get(key) == value for key, value in cell.changes.items())
+
+
 def _names() -> Iterator[tuple[str, str]]:
+    """What a directory may be called, in lower case, that holds a cell's runs; and the cell."""
+    yield from ((name.lower(), name) for name in CELLS)
     for source, target in PAIRS:
-        for cell, (role, method, frozen) in CELLS.items():
-            yield run_name(source if role == "source" else target, method, frozen), cell
-
-
-def _mapping(config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    value = config.get(key)
-    return value if isinstance(value, Mapping) else {}
+        for cell in CELLS.values():
+            env = source if cell.role == SOURCE else target
+            yield run_name(env, cell.transfer, cell.freeze, cell.changes), cell.name
 
 
 def _text(value: Any) -> str | None:

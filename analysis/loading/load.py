@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from acmr.records import CELLS, ENDED, SEED_FOLDER, SUMMARY_FILE
+from acmr.cells import CELLS, Cell, planned_cells
+from acmr.records import ENDED, SEED_FOLDER, SUMMARY_FILE
 from analysis.loading.episodes import EPISODE_FILES
 from analysis.loading.identify import PAIRS
 from analysis.loading.read_run import DAMAGED, DUPLICATE, FOREIGN, no_episodes, read_run
@@ -24,8 +25,6 @@ from analysis.loading.read_run import DAMAGED, DUPLICATE, FOREIGN, no_episodes, 
 COUNTED = (*ENDED, FOREIGN)
 #: Folders that hold other files of the same names (of W&B, Hydra).
 PASSED_OVER = ("wandb", "__pycache__")
-#: Order of the groups: the paper's experiments, then the others by name.
-CELL_ORDER = tuple(CELLS)
 
 
 class InputError(ValueError):
@@ -57,9 +56,14 @@ class RunSet:
 
     @property
     def groups(self) -> list[str]:
-        """Names of the groups that there are: the paper's cells first."""
+        """Names of the groups that there are: the cells first."""
         found = set(self.runs["group"])
-        return [cell for cell in CELL_ORDER if cell in found] + sorted(found - set(CELL_ORDER))
+        return [cell for cell in CELLS if cell in found] + sorted(found - CELLS.keys())
+
+    @property
+    def cells(self) -> list[Cell]:
+        """The cells that the folder should have."""
+        return planned_cells(self.runs["group"])
 
     @property
     def pair(self) -> tuple[str, str]:
@@ -123,7 +127,7 @@ def _runs_frame(rows: list[dict[str, Any]]) -> pd.DataFrame:
     frame = pd.DataFrame(rows, columns=list(_RUN_COLUMNS))
     frame = frame.astype({**dict.fromkeys(_FLOATS, "float64"), "seed": "Int64"})
     frame = frame.astype(dict.fromkeys(("episodes", "last_step", "horizon"), "int64"))
-    position = {cell: index for index, cell in enumerate(CELL_ORDER)}
+    position = {cell: index for index, cell in enumerate(CELLS)}
     frame["order"] = [position.get(group, len(position)) for group in frame["group"]]
     frame = frame.sort_values(["order", "group", "seed", "run"], kind="stable").drop(columns="order")
     frame["counted"] = frame["state"].isin(COUNTED)

@@ -1,12 +1,12 @@
-"""Which of the paper's runs are not there, and the commands that make them."""
+"""Which of the planned runs are not there, and the commands that make them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import pandas as pd
 
-from acmr.records import CELLS
 from analysis.loading.load import RunSet
 from analysis.loading.read_run import DAMAGED
 
@@ -38,12 +38,12 @@ def planned_seeds(runs: pd.DataFrame) -> list[int]:
 
 
 def missing_runs(data: RunSet) -> list[Missing]:
-    """Every cell and seed without a run that counts, in the paper's order."""
+    """Every planned cell and seed without a run that counts, in the order of the cells."""
     runs = data.runs
     profile = profile_of(data)
     option = "" if profile == "paper" else f" profile={profile}"
     found = []
-    for cell in CELLS:
+    for cell in (cell.name for cell in data.cells):
         for seed in planned_seeds(runs):
             there = runs[(runs["cell"] == cell) & (runs["seed"] == seed)]
             if not there["counted"].any():
@@ -64,6 +64,13 @@ def profile_of(data: RunSet) -> str:
 
 def matrix_command(data: RunSet) -> str:
     """The one command that makes all that is missing and leaves alone what is complete."""
-    seeds = planned_seeds(data.runs)
-    more = "" if tuple(seeds) == PAPER_SEEDS else f" seed={','.join(map(str, seeds))}"
-    return f"python run.py matrix={profile_of(data)}{more}"
+    words, seeds = [f"python run.py matrix={profile_of(data)}"], planned_seeds(data.runs)
+    if not all(cell.published for cell in data.cells):
+        words.append(f"experiment={_list(cell.name for cell in data.cells)}")
+    if tuple(seeds) != PAPER_SEEDS:
+        words.append(f"seed={_list(seeds)}")
+    return " ".join(words)
+
+
+def _list(values: Iterable[object]) -> str:
+    return ",".join(map(str, values))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,12 @@ import jinja2
 import pandas as pd
 
 from acmr.records import CONFIG_FILE, LOG_FILE, SUMMARY_FILE
+from analysis.analyze import Analysis
 from analysis.loading.episodes import EPISODE_FILES
-from analysis.loading.load import RunSet
-from analysis.loading.missing import Missing
+from analysis.loading.missing import matrix_command, profile_of
+from analysis.loading.setting_differences import setting_differences
 from analysis.loading.speed import METRICS_FILES
+from analysis.report import prose
 from analysis.report.published import published_table3
 from analysis.report.tables import heading, readable
 
@@ -54,30 +56,19 @@ class Table:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything the report shows."""
+    """Everything the report shows.
 
-    data: RunSet
-    profile: str
-    threshold: float
-    consecutive: int
-    cells: pd.DataFrame
-    table1: pd.DataFrame
-    table2: pd.DataFrame
-    table3: pd.DataFrame
-    groups: pd.DataFrame
-    published: pd.DataFrame
-    transfer: pd.DataFrame
-    measured: pd.DataFrame
-    defining: pd.DataFrame
-    differing: pd.DataFrame
+    Attributes:
+        analysis: The numbers.
+        tables: The tables that are written, by file name.
+        pictures: The figures, in the order in which they are shown.
+        left_out: A line for what could not be made.
+    """
+
+    analysis: Analysis
+    tables: Mapping[str, pd.DataFrame]
     pictures: list[Picture]
-    missing: list[Missing]
-    matrix_command: str
-    planned_runs: int
     left_out: list[str]
-    about_n: list[str]
-    caveats: list[str]
-    how_runs_count: list[str]
 
 
 def data_uri(content: bytes, kind: str) -> str:
@@ -103,13 +94,23 @@ def write_report(report: Report, out: Path) -> Path:
         lstrip_blocks=True,
     )
     environment.filters["words"] = heading
+    numbers = report.analysis
+    defining, differing = setting_differences(numbers.data)
     page = environment.get_template("report.html").render(
         report=report,
+        analysis=numbers,
+        profile=profile_of(numbers.data),
+        matrix_command=matrix_command(numbers.data),
         table=_table,
-        runs=_runs(report, out),
+        runs=_runs(numbers, out),
         source=published_table3()["source"].iloc[0],
-        detailed=_detailed(report.table3),
+        detailed=_detailed(numbers.table3),
         notes=_notes,
+        defining=defining,
+        differing=differing,
+        about_n=prose.about_n(numbers.table3, numbers.data.cells),
+        caveats=prose.caveats(numbers.threshold, numbers.data.cells),
+        how_runs_count=prose.how_runs_count(numbers.consecutive),
     )
     path = out / "report.html"
     path.write_text(page, encoding="utf-8")
@@ -137,10 +138,10 @@ def _notes(comparisons: pd.DataFrame) -> list[str]:
     return list(dict.fromkeys(note for row in comparisons["note"] for note in row.split("; ") if note))
 
 
-def _runs(report: Report, out: Path) -> list[dict[str, Any]]:
+def _runs(analysis: Analysis, out: Path) -> list[dict[str, Any]]:
     rows = []
-    for name, run in report.measured.iterrows():
-        directory = report.data.root / str(name)
+    for name, run in analysis.measured.iterrows():
+        directory = analysis.data.root / str(name)
         links = [(file, _relative(directory / file, out)) for file in RUN_FILES if (directory / file).is_file()]
         rows.append(
             {

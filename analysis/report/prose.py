@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import pandas as pd
 
+from acmr.cells import Cell
 from acmr.records import CONFIG_FILE, SUMMARY_FILE
-from analysis.statistics.comparisons import FAMILY, LARGE_EFFECT
+from analysis.statistics.comparisons import LARGE_EFFECT
 from analysis.statistics.two_samples import ALPHA, detectable_effect, power, smallest_permutation_p
 
 
-def about_n(table3: pd.DataFrame) -> list[str]:
+def about_n(table3: pd.DataFrame, cells: Sequence[Cell]) -> list[str]:
     """What the number of runs allows, for the smallest comparison that there is.
 
     Args:
         table3: Rows with ``runs_reference`` and ``runs_index``.
+        cells: The cells that there should be.
     """
     sizes = [(int(a), int(b)) for a, b in zip(table3["runs_reference"], table3["runs_index"], strict=True) if a and b]
     if not sizes:
@@ -33,12 +37,21 @@ def about_n(table3: pd.DataFrame) -> list[str]:
         f"It finds a large effect ({LARGE_EFFECT} standard deviations) in {power(LARGE_EFFECT, n, m):.0%} of all "
         f"cases; to find it in 80% the true effect must be {detectable_effect(n, m):.1f} standard deviations. A result "
         "that is not significant therefore says little, and one that is overstates the size of the effect.",
-        _least_n(),
+        _least_n(max(map(len, _families(cells)))),
     ]
 
 
-def caveats(threshold: float) -> list[str]:
-    """What a careful reader should know, whatever the numbers are."""
+def caveats(threshold: float, cells: Sequence[Cell]) -> list[str]:
+    """What a careful reader should know, whatever the numbers are.
+
+    Args:
+        threshold: Return to reach.
+        cells: The cells that there should be.
+    """
+    families = " ".join(
+        f"The p-values of {', '.join(family)} answer one question {_times(len(family))}." for family in _families(cells)
+    )
+    others = " and ".join(cell.name for cell in cells if cell.baseline and not cell.family)
     survival = (
         f"The threshold of {threshold:g} is close to mere survival: standing upright for 1,000 steps earns a Humanoid "
         "5,000 of healthy reward, less the cost of control. Look at episode length and forward velocity beside it."
@@ -53,8 +66,8 @@ def caveats(threshold: float) -> list[str]:
         "comparisons with A0 do not order A2 and A3.",
         "The paper takes p = .54 between H0 and A0 for no difference. A test that finds none is no proof of "
         "equivalence: the interval of the difference says which differences remain possible.",
-        f"The p-values of {', '.join(FAMILY)} answer one question four times. Holm's adjustment stands beside them; it "
-        "leaves out H0 and H1, which are other questions. A cell that never reached the threshold stays in the family.",
+        f"{families} Holm's adjustment stands beside them; it leaves out {others}, which are other questions. A cell "
+        "that never reached the threshold stays in the family.",
         "Students of one seed share a teacher, and H1 continues H0; the tests take cells as independent, as the "
         "paper does.",
     ]
@@ -78,10 +91,21 @@ def how_runs_count(consecutive: int) -> list[str]:
     ]
 
 
-def _least_n() -> str:
-    n = next(n for n in range(2, 20) if len(FAMILY) * smallest_permutation_p(n, n) < ALPHA)
+def _families(cells: Sequence[Cell]) -> list[list[str]]:
+    """Cells whose p-values are adjusted together."""
+    names = dict.fromkeys(cell.family for cell in cells if cell.family)
+    return [[cell.name for cell in cells if cell.family == name] for name in names]
+
+
+def _times(count: int) -> str:
+    words = {1: "once", 2: "twice", 3: "three times", 4: "four times", 5: "five times", 6: "six times"}
+    return words.get(count, f"{count} times")
+
+
+def _least_n(comparisons: int) -> str:
+    n = next(n for n in range(2, 20) if comparisons * smallest_permutation_p(n, n) < ALPHA)
     least = smallest_permutation_p(n, n)
     return (
-        f"{n} runs a cell are the least with which the exact test can pass Holm's adjustment over {len(FAMILY)} "
-        f"comparisons (least p-value {least:.4f}, adjusted {len(FAMILY) * least:.3f})."
+        f"{n} runs a cell are the least with which the exact test can pass Holm's adjustment over {comparisons} "
+        f"comparisons (least p-value {least:.4f}, adjusted {comparisons * least:.3f})."
     )

@@ -16,9 +16,6 @@ from analysis.figures import stills
 from analysis.figures.data import MOST_OTHERS, FigureData, default_window, learning_curves, training_speeds
 from analysis.figures.paper import FIGURES, draw_all, picture, save
 from analysis.figures.style import apply
-from analysis.loading.missing import matrix_command, profile_of
-from analysis.loading.setting_differences import setting_differences
-from analysis.report import prose
 from analysis.report.html import Picture, Report, data_uri, write_report
 from analysis.report.published import side_by_side
 from analysis.report.tables import STEPS_COLUMNS, paper_columns, write_table
@@ -57,36 +54,12 @@ def write_results(analysis: Analysis, out: Path, options: argparse.Namespace, sc
     # The pictures take seconds, in processes of their own: they are made while the rest is.
     rendering = [] if options.no_stills else stills.start(analysis.data.pair, scratch)
     try:
-        report_tables = _write_tables(analysis, out, written)
+        tables = _write_tables(analysis, out, written)
         pictures = _write_figures(analysis, out, options, written)
         pictures = _write_stills(rendering, out, options.format, written) + pictures
     finally:
         stills.stop(rendering)
-    defining, differing = setting_differences(analysis.data)
-    write_report(
-        Report(
-            data=analysis.data,
-            profile=profile_of(analysis.data),
-            threshold=analysis.threshold,
-            consecutive=analysis.consecutive,
-            cells=analysis.cells,
-            table3=analysis.table3,
-            groups=analysis.others,
-            measured=analysis.measured,
-            defining=defining,
-            differing=differing,
-            pictures=pictures,
-            missing=analysis.missing,
-            matrix_command=matrix_command(analysis.data),
-            planned_runs=analysis.planned_runs,
-            left_out=written.left_out,
-            about_n=prose.about_n(analysis.table3),
-            caveats=prose.caveats(analysis.threshold),
-            how_runs_count=prose.how_runs_count(analysis.consecutive),
-            **report_tables,
-        ),
-        out,
-    )
+    write_report(Report(analysis, tables, pictures, written.left_out), out)
     return written
 
 
@@ -104,29 +77,23 @@ def _clear(out: Path) -> None:
 
 def _write_tables(analysis: Analysis, out: Path, written: Written) -> dict[str, pd.DataFrame]:
     data, measured = analysis.data, analysis.measured
-    tables = {
-        "table1": table1(),
-        "table2": table2(data),
-        "published": side_by_side(analysis.table3),
-        "transfer": transfer_table(measured, data.groups, analysis.reference),
+    plan = {
+        "table1": (table1(), "Overview of ACMR configurations.", None),
+        "table2": (table2(data), "Experiment overview.", None),
+        "table3": (analysis.table3, "Statistical comparison of steps to threshold.", paper_columns()),
+        "published_table3": (side_by_side(analysis.table3), "Table 3 beside the published one.", None),
+        "transfer": (transfer_table(measured, data.groups, analysis.reference), "Transfer metrics.", None),
+        "cells": (analysis.cells, "Steps to threshold by group.", None),
+        "steps_to_threshold": (steps_table(measured), "Steps to threshold of each run.", STEPS_COLUMNS),
     }
-    plan = [
-        ("table1", tables["table1"], "Overview of ACMR configurations.", None),
-        ("table2", tables["table2"], "Experiment overview.", None),
-        ("table3", analysis.table3, "Statistical comparison of steps to threshold.", paper_columns()),
-        ("published_table3", tables["published"], "Table 3 beside the published one.", None),
-        ("transfer", tables["transfer"], "Transfer metrics.", None),
-        ("cells", analysis.cells, "Steps to threshold by group.", None),
-        ("steps_to_threshold", steps_table(measured), "Steps to threshold of each run.", STEPS_COLUMNS),
-    ]
     if len(analysis.others):
-        plan.append(("comparisons", analysis.others, "Groups that are no cells of the paper.", paper_columns()))
-    for name, table, caption, columns in plan:
+        plan["comparisons"] = (analysis.others, "Groups that are no cells.", paper_columns())
+    for name, (table, caption, columns) in plan.items():
         write_table(table, out, name, caption, columns)
     arrays: dict[str, Any] = scores(measured)
     np.savez(out / "scores.npz", **arrays)
     written.tables = len(plan)
-    return tables
+    return {name: table for name, (table, _, _) in plan.items()}
 
 
 def _write_figures(analysis: Analysis, out: Path, options: argparse.Namespace, written: Written) -> list[Picture]:

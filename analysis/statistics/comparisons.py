@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from acmr.records import CELLS
+from acmr.cells import CELLS, REFERENCE, TARGET, planned_cells
 from analysis.loading.load import InputError
 from analysis.statistics.survival import log_rank, restricted_mean
 from analysis.statistics.two_samples import (
@@ -24,10 +24,8 @@ from analysis.statistics.two_samples import (
     t_test,
 )
 
-#: Rows of the paper's table 3: (reference, index).
-PAPER_ROWS = (("A0", "A1"), ("A0", "A2"), ("A0", "A3"), ("A0", "A4"), ("A0", "H0"), ("H0", "H1"))
-#: Cells that stand for one question asked several times (which transfer helps?): Holm's family.
-FAMILY = ("A1", "A2", "A3", "A4")
+#: Family of the groups that are no cells.
+_OTHERS = ""
 #: A large effect (Cohen, 1988), for the power.
 LARGE_EFFECT = 0.8
 
@@ -46,8 +44,8 @@ COLUMNS = [
 ]
 
 
-def compare_cells(runs: pd.DataFrame, reference: str = "A0", planned: int = 3) -> pd.DataFrame:
-    """The paper's table 3.
+def compare_cells(runs: pd.DataFrame, reference: str = REFERENCE, planned: int = 3) -> pd.DataFrame:
+    """Table 3: each cell against its baseline.
 
     Args:
         runs: The runs with their metrics (:func:`analysis.statistics.metrics.measure`).
@@ -55,16 +53,18 @@ def compare_cells(runs: pd.DataFrame, reference: str = "A0", planned: int = 3) -
         planned: Seeds that a group is planned to have, for the notes.
 
     Returns:
-        The paper's rows in the paper's order, with ``COLUMNS``; with another reference, A0 is one of the others.
+        One row a cell with ``COLUMNS``, in the paper's order: the target's cells first. With another reference, A0 is
+        one of the others.
     """
-    pairs = list(PAPER_ROWS)
-    if reference != "A0":
-        others = [cell for cell in ("A0", *FAMILY, "H0") if cell != reference]
-        pairs = [*((reference, cell) for cell in others), ("H0", "H1")]
+    pairs = []
+    for cell in sorted(planned_cells(runs["group"]), key=lambda cell: cell.role != TARGET):
+        baseline = reference if REFERENCE in (cell.name, cell.baseline) else cell.baseline
+        if baseline not in (None, cell.name):
+            pairs.append((baseline, cell.name))
     return _compare(runs, pairs, planned)
 
 
-def compare_groups(runs: pd.DataFrame, reference: str = "A0", planned: int = 3) -> pd.DataFrame:
+def compare_groups(runs: pd.DataFrame, reference: str = REFERENCE, planned: int = 3) -> pd.DataFrame:
     """The groups that are no cells (sweeps, foreign runs), each against the reference; columns as in table 3."""
     others = sorted(set(runs.loc[runs["cell"].isna(), "group"]) - {reference})
     return _compare(runs, [(reference, other) for other in others], planned)
@@ -111,9 +111,11 @@ def _compare(runs: pd.DataFrame, pairs: list[tuple[str, str]], planned: int) -> 
     kinds = {column: "int64" if column in whole else "float64" for column in COLUMNS if column not in text}
     table = table.astype(kinds)
     asked = (table["runs_reference"] > 0) & (table["runs_index"] > 0)
-    family = asked & ((table["index"].isin(FAMILY)) | ~table["index"].isin(CELLS))
-    table.loc[family, "p_holm"] = holm(table.loc[family, "p_value"])
-    table.loc[family, "p_permutation_holm"] = holm(table.loc[family, "p_permutation"])
+    families = pd.Series([CELLS[index].family if index in CELLS else _OTHERS for index in table["index"]], dtype=object)
+    for family in set(families.dropna()):
+        rows = asked & (families == family)
+        table.loc[rows, "p_holm"] = holm(table.loc[rows, "p_value"])
+        table.loc[rows, "p_permutation_holm"] = holm(table.loc[rows, "p_permutation"])
     return table
 
 

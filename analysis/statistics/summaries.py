@@ -5,35 +5,39 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from acmr.records import CELLS
+from acmr.cells import CELLS, REFERENCE, SOURCE, TARGET
 from analysis.loading.load import RunSet
 from analysis.statistics.metrics import jumpstart, transfer_ratio
 from analysis.statistics.survival import restricted_mean
 from analysis.statistics.two_samples import mean_interval
 
-#: The paper's names of the configurations (tables 1 and 2).
-CONFIGURATIONS = {"H0": "Baseline", "H1": "POC", "A0": "Baseline"} | {f"A{n}": f"Conf. {n}" for n in range(1, 5)}
-#: What a cell's transfer is measured against.
-BASELINES = {"H0": None, "H1": "H0", "A0": None}
-
 
 def table1() -> pd.DataFrame:
-    """Overview of the configurations (paper, table 1)."""
-    label = {(transfer, freeze): CONFIGURATIONS[cell] for cell, (_, transfer, freeze) in CELLS.items()}
+    """Overview of the paper's configurations (paper, table 1)."""
+    label = {(cell.transfer, cell.freeze): cell.configuration for cell in CELLS.values() if cell.published}
     rows = [("Yes" if freeze else "No", label["hidden", freeze], label["expand", freeze]) for freeze in (False, True)]
     return pd.DataFrame(rows, columns=["Freeze", "Hidden Layer Transfer", "Layer Expansion"])
 
 
 def table2(data: RunSet) -> pd.DataFrame:
     """Overview of the experiments (paper, table 2), with the settings that they stand for and the runs that count."""
-    names = dict(zip(("source", "target"), data.pair, strict=True))
+    names = dict(zip((SOURCE, TARGET), data.pair, strict=True))
     counted = data.runs[data.runs["counted"]].groupby("group").size()
-    rows = [
-        (cell, role.capitalize(), CONFIGURATIONS[cell], names[role], transfer, freeze, int(counted.get(cell, 0)))
-        for cell, (role, transfer, freeze) in CELLS.items()
-    ]
-    columns = ["Experiment", "Environment", "Configuration", "environment_name", "transfer", "freeze", "runs"]
-    return pd.DataFrame(rows, columns=columns)
+    table = pd.DataFrame(
+        {
+            "Experiment": cell.name,
+            "Environment": cell.role.capitalize(),
+            "Configuration": cell.configuration,
+            "environment_name": names[cell.role],
+            "transfer": cell.transfer,
+            "freeze": cell.freeze,
+            "settings": ", ".join(f"{key}={value}" for key, value in cell.changes.items()),
+            "runs": int(counted.get(cell.name, 0)),
+        }
+        for cell in data.cells
+    )
+    # The paper's cells need no column for it.
+    return table if table["settings"].any() else table.drop(columns="settings")
 
 
 def steps_table(runs: pd.DataFrame) -> pd.DataFrame:
@@ -82,10 +86,13 @@ def cell_table(runs: pd.DataFrame, groups: list[str]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
-def transfer_table(runs: pd.DataFrame, groups: list[str], reference: str = "A0") -> pd.DataFrame:
+def transfer_table(runs: pd.DataFrame, groups: list[str], reference: str = REFERENCE) -> pd.DataFrame:
     """The metrics of Taylor and Stone (2009) by group: means over its counted runs, and against its baseline.
 
-    The baseline of H1 is H0, that of the others the reference.
+    Args:
+        runs: The runs with their metrics.
+        groups: Groups in the order of the rows.
+        reference: Baseline of the groups that are no cells, and of the cells whose baseline is A0.
     """
     columns = ["initial_return", "asymptotic_return", "area_under_curve"]
     table = runs[runs["counted"]].groupby("group")[columns].mean()
@@ -94,7 +101,7 @@ def transfer_table(runs: pd.DataFrame, groups: list[str], reference: str = "A0")
     nothing = dict.fromkeys(columns, float("nan"))
     rows = []
     for group in groups:
-        name = BASELINES.get(group, reference if group != reference else None)
+        name = _baseline(group, reference)
         own, base = means.get(group, nothing), means.get(name or "", nothing)
         rows.append(
             {
@@ -107,6 +114,17 @@ def transfer_table(runs: pd.DataFrame, groups: list[str], reference: str = "A0")
             }
         )
     return pd.DataFrame(rows)
+
+
+def _baseline(group: str, reference: str) -> str | None:
+    """What a group's returns are measured against, as far as it learns in the same environment."""
+    against: str | None = reference
+    if group in CELLS:
+        own = CELLS.get(CELLS[group].baseline or "")
+        # H0 is compared with A0 by its steps, but another robot's returns are of another scale.
+        alike = own is not None and own.role == CELLS[group].role
+        against = None if own is None or not alike else reference if own.name == REFERENCE else own.name
+    return against if against != group else None
 
 
 def scores(runs: pd.DataFrame) -> dict[str, np.ndarray]:
