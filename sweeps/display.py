@@ -1,4 +1,4 @@
-"""What the user sees of a sweep: a live table in a terminal, plain lines elsewhere, and a table at the end."""
+"""What the user sees of a sweep: a live table in a terminal, plain lines elsewhere, and at the end what failed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
@@ -17,12 +17,15 @@ from acmr.text import duration, size
 from sweeps.estimate import Estimate
 from sweeps.folder import FAILED, FINAL, OUTPUT_FILE, WAITING, SweepFolder, SweepRun
 from sweeps.plan import Plan, PlannedRun
-from sweeps.view import BLOCKED, LOST, RunStatus, counts, steps_ahead, table, view_entries
+from sweeps.table import counts, make_console, reasons, run_table
+from sweeps.view import BLOCKED, LOST, RunStatus, steps_ahead, view_entries
 
 #: Seconds between two plain lines on how far everything is.
 LINE_INTERVAL = 60.0
 #: Seconds after which the average speed since the start says more than the present one.
 _SETTLED = 30.0
+#: Lines on why runs are in their states, and rows of runs, that the live table has where the terminal is low.
+_MOST_REASONS, _FEWEST_ROWS = 3, 3
 
 
 class Display:
@@ -42,7 +45,7 @@ class Display:
         self._said_at = self._looked_at = self._started
         # Looking at many runs takes time from the trainings.
         self._interval = 1.0 if len(entries) <= 100 else 5.0
-        self._console = Console(highlight=False)
+        self._console = make_console()
         terminal = sys.stdout.isatty() and os.environ.get("TERM") not in (None, "", "dumb")
         self.refresh()
         self._first_steps = self._steps()
@@ -94,23 +97,18 @@ class Display:
         eta = f"; {speed:,.0f} steps/s, {duration(ahead / speed)} left" if speed and ahead else ""
         return f"{counts(self.views)}{eta}"
 
-    def closing_table(self) -> int:
-        """Prints what went wrong and why.
+    def tell_failures(self) -> int:
+        """Prints what went wrong, why, and where the log is.
 
         Returns:
             How many runs failed or cannot start.
         """
-        rows = [("state", "run", "seed", "log", "why")]
         for view in self.views:
             if view.state in (FAILED, BLOCKED, DIVERGED, LOST):
+                self.say(_sentence(view, view.reason))
                 log = view.directory / OUTPUT_FILE
-                rows.append((view.state, view.name, str(view.seed), str(log) if log.exists() else "-", view.reason))
-        if len(rows) > 1:
-            widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
-            for row in rows:
-                self.say(
-                    "  ".join([*(cell.ljust(width) for cell, width in zip(row[:-1], widths, strict=True)), row[-1]])
-                )
+                if log.exists():
+                    self.say(f"  log: {log}")
         return sum(view.state in (FAILED, BLOCKED) for view in self.views)
 
     def _tell(self, index: int, view: RunStatus) -> None:
@@ -118,10 +116,10 @@ class Display:
         if before is None and view.state != RUNNING:
             return
         if view.state in (RUNNING, *FINAL, STOPPED, BLOCKED):
-            detail = f": {view.reason}" if view.reason else ""
+            detail = view.reason
             if view.state == COMPLETE and view.latest is not None:
-                detail = f": return {view.latest:,.0f}, {view.speed:,.0f} steps/s"
-            self.say(f"{view.state}  {view.name} seed {view.seed}{detail}")
+                detail = f"return {view.latest:,.0f}, {view.speed:,.0f} steps/s"
+            self.say(_sentence(view, detail))
 
     def _steps(self) -> int:
         return sum(view.step for view in self.views)
@@ -132,20 +130,24 @@ class Display:
         return (self._steps() - self._first_steps) / elapsed if elapsed > _SETTLED else now
 
     def _drawing(self) -> Group:
-        height = max(self._console.size.height - 4, 5)
+        whole = Text(self.line(), style="bold")
+        why = reasons(self.views)[:_MOST_REASONS]
+        for line in why:
+            line.no_wrap, line.overflow = True, "ellipsis"
+        lines_below = len(why) + len(whole.wrap(self._console, self._console.width))
+        # Two more for the header and for the line that the cursor is in.
+        height = max(self._console.height - lines_below - 2, _FEWEST_ROWS)
         shown = self.views
         if len(shown) > height:
             # What runs or went wrong first; the rest is in the line below.
             quiet = (COMPLETE, WAITING)
             shown = sorted(self.views, key=lambda view: (view.state in quiet, view.state))[:height]
-        text = Text(self.line(), style="bold", no_wrap=True, overflow="ellipsis")
-        lines = [Text(line, style=color or "", no_wrap=True, overflow="ellipsis") for line, color in table(shown)]
-        return Group(*lines, text)
+        return Group(run_table(shown, self._console), *why, whole)
 
 
 def print_plan(plan: Plan, needs: Estimate, workers: int, output_dir: Path) -> None:
     """Prints what would be done."""
-    console = Console(width=None if sys.stdout.isatty() else 200, highlight=False)
+    console = make_console()
     stage_of = {run.index: number for number, stage in enumerate(plan.stages, start=1) for run in stage}
     for run in plan.runs:
         cell = f"{run.spec.cell}  " if run.spec.cell else ""
@@ -167,6 +169,10 @@ def print_plan(plan: Plan, needs: Estimate, workers: int, output_dir: Path) -> N
         console.print(f"stop: the time counts on runs that meet their threshold {guide}", soft_wrap=True)
     console.print(f"memory: {_bytes(needs.memory)} at most, once the replay memories are full", soft_wrap=True)
     console.print(f"disk: {_bytes(needs.disk)} at most; {_bytes(needs.kept)} stay", soft_wrap=True)
+
+
+def _sentence(view: RunStatus, detail: str) -> str:
+    return f"{view.state}  {view.name} seed {view.seed}{f': {detail}' if detail else ''}"
 
 
 def _remark(run: PlannedRun) -> str:

@@ -8,12 +8,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from acmr.records import CONFIG_FILE, RUN_PATTERN, RUNNING, SEED_FOLDER, STATUS_FILE
 from acmr.text import duration
 from sweeps.folder import FAILED, WAITING, State, SweepFolder, SweepRun, all_folders
-from sweeps.view import BLOCKED, LOST, RunStatus, counts, steps_ahead, table, view_entries, view_run
+from sweeps.table import counts, make_console, reasons, run_table
+from sweeps.view import BLOCKED, LOST, RunStatus, steps_ahead, view_entries, view_run
 
 #: States for which somebody has to do something.
 _BAD = (FAILED, LOST, BLOCKED)
@@ -58,13 +57,6 @@ def _seed(directory: Path) -> int:
     return int(match[1]) if match else 0
 
 
-def _say(console: Console, line: str, color: str | None = None) -> None:
-    if console.is_terminal:
-        console.print(line, style=color, markup=False, soft_wrap=True)
-    else:
-        print(line)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints the table; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m sweeps.status", description=__doc__)
@@ -74,13 +66,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{output_dir}: no runs there yet; python run.py trains one")
         return 0
     views = all_runs(output_dir)
-    console = Console(highlight=False)
-    for line, color in table(views):
-        _say(console, line, color)
+    console = make_console()
+    console.print(run_table(views, console))
+    for line in reasons(views):
+        console.print(line, soft_wrap=True)
     running = [view for view in views if view.state == RUNNING]
     speed = sum(view.speed for view in running)
     eta = f"; {speed:,.0f} steps/s, {duration(steps_ahead(views) / speed)} left" if speed else ""
-    _say(console, f"{len(views)} runs: {counts(views)}{eta}")
+    console.print(f"{len(views)} runs: {counts(views)}{eta}", style="bold", markup=False, soft_wrap=True)
     return 1 if any(view.state in _BAD for view in views) else 0
 
 

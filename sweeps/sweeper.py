@@ -120,14 +120,14 @@ class Sweep:
         # Who started this in the background may have chosen that some do not reach it.
         wanted = [each for each in STOP_SIGNALS if signal.getsignal(each) is not signal.SIG_IGN]
         before = {each: signal.signal(each, self._note) for each in wanted}
-        board = Display(self._folder, self._entries, self._output_dir)
+        display = Display(self._folder, self._entries, self._output_dir)
         try:
-            self._launch_all(board)
+            self._launch_all(display)
         finally:
-            board.close()
+            display.close()
             for each, handler in before.items():
                 signal.signal(each, handler)
-        code = self._report(board)
+        code = self._report(display)
         if self._abandoned:
             # A launcher that still waits for jobs holds nothing any more, and would not let this process end.
             sys.stdout.flush()
@@ -140,33 +140,33 @@ class Sweep:
         with suppress(OSError):
             self._folder.stop(at_once=again)
 
-    def _launch_all(self, board: Display) -> None:
+    def _launch_all(self, display: Display) -> None:
         number = fruitless = 0
         while self._signal is None and (runs := self._to_launch()):
             before = [self._state(index) for index in runs]
             launch = Launch(self._adapter, self._folder, runs, number)
-            self._await(launch, board)
+            self._await(launch, display)
             if self._signal is not None:
                 return
             if launch.error is not None:
-                board.say(f"jobs were lost ({one_line(launch.error)}); what they were training is taken up again")
+                display.say(f"jobs were lost ({one_line(launch.error)}); what they were training is taken up again")
             self._settle()
             number += 1
             fruitless = fruitless + 1 if before == [self._state(index) for index in runs] else 0
             if fruitless > self._settings.retries:
                 why = f" ({one_line(launch.error)})" if launch.error else ""
-                board.say(f"error: the launcher starts no jobs{why}")
+                display.say(f"error: the launcher starts no jobs{why}")
                 return
 
-    def _await(self, launch: Launch, board: Display) -> None:
+    def _await(self, launch: Launch, display: Display) -> None:
         deadline, quiet = float("inf"), 0
         while not launch.is_over(_GLANCE):
-            board.tick()
+            display.tick()
             if self._signal is None:
                 continue
             if deadline == float("inf"):
                 deadline = time.monotonic() + self._settings.grace + _MARGIN
-                board.say("stopping: the trainings write their checkpoints (once more to end them at once)")
+                display.say("stopping: the trainings write their checkpoints (once more to end them at once)")
                 launch.cancel()
             # Hundreds of runs may still wait in the workers' queue; handing them out to nobody takes long.
             quiet = quiet + 1 if self._adapter.workers_pick_runs and not self._is_training() else 0
@@ -202,16 +202,16 @@ class Sweep:
                 lost = FAILED if failures > self._settings.retries else STOPPED
                 self._folder.set_state(index, State(lost, failures, LOST_REASON))
 
-    def _report(self, board: Display) -> int:
-        failed = board.closing_table()
-        complete = sum(view.state == COMPLETE for view in board.views)
-        print(f"{complete} of {len(board.views)} runs complete: {_places(self._plan)}")
+    def _report(self, display: Display) -> int:
+        failed = display.tell_failures()
+        complete = sum(view.state == COMPLETE for view in display.views)
+        print(f"{complete} of {len(display.views)} runs complete: {_places(self._plan)}")
         if self._signal is not None:
             print(f"stopped by {signal.Signals(self._signal).name}; to go on: {self._command()}", flush=True)
             return 128 + self._signal
         if failed:
             print(f"to try again what failed: {self._command()}", flush=True)
-        return 1 if failed or any(view.state not in FINAL for view in board.views) else 0
+        return 1 if failed or any(view.state not in FINAL for view in display.views) else 0
 
     def _command(self) -> str:
         return str(self._folder.header()["command"])

@@ -1,13 +1,10 @@
-"""How far runs are, and how far they have to go: read from their directories, shown as a table.
-
-Imports nothing heavy.
-"""
+"""The state of runs and the steps they have left, read from their directories; imports nothing heavy."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,16 +13,12 @@ from acmr.cells import full_name, stops
 from acmr.records import COMPLETE, DIVERGED, ENDED, RUNNING, STOPPED, SUMMARY_FILE
 from acmr.storage.json_files import read_json
 from acmr.storage.processes import is_alive
-from acmr.text import duration
 from acmr.tracking.status_file import read_status
 from sweeps.folder import FAILED, FINAL, WAITING, State, SweepRun
 
 #: A run that says it is running, but whose process is gone or has said nothing for so many seconds.
 LOST, SILENCE = "lost", 600.0
 BLOCKED = "blocked"
-_HEADER = ["run", "seed", "state", "step", "steps/s", "ETA", "return", ""]
-_LEFT = ("run", "state", "")
-_COLORS = {COMPLETE: "green", DIVERGED: "magenta", FAILED: "red", RUNNING: "cyan", LOST: "red", BLOCKED: "red"}
 
 
 @dataclass(frozen=True)
@@ -121,30 +114,6 @@ def view_entries(
     return views
 
 
-def table(views: Iterable[RunStatus]) -> list[tuple[str, str | None]]:
-    """The runs, one a line below a header, each with its color."""
-    shown = list(views)
-    rows = [_HEADER, *(_cells(view) for view in shown)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADER))]
-    lines = []
-    for row in rows:
-        cells = [
-            cell.ljust(width) if name in _LEFT else cell.rjust(width)
-            for cell, width, name in zip(row, widths, _HEADER, strict=True)
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return list(zip(lines, ["bold", *(_COLORS.get(view.state) for view in shown)], strict=True))
-
-
-def counts(views: Iterable[RunStatus]) -> str:
-    """How many runs are in which state."""
-    numbers: dict[str, int] = {}
-    for view in views:
-        numbers[view.state] = numbers.get(view.state, 0) + 1
-    order = (COMPLETE, DIVERGED, RUNNING, WAITING, STOPPED, LOST, BLOCKED, FAILED)
-    return ", ".join(f"{numbers[state]} {state}" for state in order if state in numbers) or "no runs"
-
-
 class Lengths:
     """Steps that runs needed to meet their thresholds, those included that came to their end before.
 
@@ -192,20 +161,6 @@ def steps_ahead(views: Sequence[RunStatus]) -> float:
 
 def _kind(directory: Path) -> tuple[str, str]:
     return directory.parts[-3], full_name(directory.parts[-2])
-
-
-def _cells(view: RunStatus) -> list[str]:
-    share = f" {100 * view.step / view.total:3.0f}%" if view.total else ""
-    return [
-        view.name,
-        str(view.seed),
-        view.state,
-        f"{view.step:,}{share}" if view.step else "-",
-        f"{view.speed:,.0f}" if view.speed else "-",
-        f"{'<' if stops(view.directory.parts[-2]) and view.seconds_left else ''}{duration(view.seconds_left)}",
-        f"{view.latest:,.0f}" if view.latest is not None else "-",
-        view.reason,
-    ]
 
 
 def _told(status: dict[str, Any], state: State, alive: bool) -> tuple[str, str]:

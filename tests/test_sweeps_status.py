@@ -14,7 +14,8 @@ import pytest
 from acmr.records import RUNNING, STOPPED
 from sweeps.folder import FAILED, State, SweepFolder, SweepRun, all_folders
 from sweeps.status import main
-from sweeps.view import counts, view_entries, view_run
+from sweeps.table import counts
+from sweeps.view import view_entries, view_run
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 

@@ -1,0 +1,152 @@
+"""The table of runs in terminals of any width, and in pipes."""
+
+import fcntl
+import io
+import os
+import pty
+import struct
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+from rich.text import Text
+from test_sweeps_status import ended, heartbeat
+
+from acmr.records import COMPLETE, RUNNING
+from sweeps.folder import FAILED, WAITING
+from sweeps.table import reasons, run_table, shorten
+from sweeps.view import BLOCKED, LOST, RunStatus
+
+RATES = [f"ant_three_legs-none-hidden_sizes=16+16-q_lr={rate}-total_timesteps=1000000" for rate in ("1e-05", "0.0003")]
+RATES += [RATES[1].replace("0.0003", "0.003")]
+
+
+def status(name: str, state: str = RUNNING, **more: object) -> RunStatus:
+    return RunStatus(name, 1, Path("runs/quick") / name / "seed_1", state, **more)
+
+
+VIEWS = [
+    status(RATES[0], step=123_456, total=1_000_000, speed=1061.3, latest=4321.5),
+    status(RATES[1], step=123_456, total=1_000_000, speed=61.3, latest=-321.5),
+    status(RATES[2], WAITING, total=1_000_000),
+    status("A3  armless_humanoid-hidden-frozen", COMPLETE, step=1_000_000, total=1_000_000, speed=80, latest=5120),
+    status("A0  armless_humanoid-none-stop=threshold", step=523_456, total=1_000_000, speed=161.3, latest=99),
+    status("H0  [bold]humanoid[/bold]", FAILED, reason="RuntimeError: the cart [0] has no wheels"),
+]
+
+
+def printed(width: int, views: list[RunStatus] = VIEWS) -> list[str]:
+    console = Console(width=width, file=io.StringIO(), highlight=False)
+    console.print(run_table(views, console))
+    return console.file.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("width", [40, 45, 60, 79, 80, 100, 120, 300])
+def test_state_speed_time_left_and_return_are_whole_at_any_width(width):
+    header, *lines = printed(width)
+    assert len(lines) == len(VIEWS)
+    assert all(len(line) <= width for line in [header, *lines])
+    kept = [line.split() for line in lines]
+    assert [words[-3:] for words in kept] == [
+        ["1,061", "13:46", "4,322"],
+        ["61", "3:58:19", "-322"],
+        ["-", "-", "-"],
+        ["80", "-", "5,120"],
+        ["161", "<49:14", "99"],
+        ["-", "-", "-"],
+    ]
+    for view, words in zip(VIEWS, kept, strict=True):
+        assert view.state in words
+    assert len({line.split()[0] for line in lines[:3]}) == 3, "three rates, three names"
+
+
+def test_with_room_enough_names_are_whole_and_steps_are_told():
+    header, *lines = printed(200)
+    assert header.split() == ["run", "seed", "state", "step", "steps/s", "ETA", "return"]
+    assert [line.startswith(view.name) for line, view in zip(lines, VIEWS, strict=True)] == [True] * len(VIEWS)
+    assert " 123,456  12% " in lines[0]
+    # Nothing pads a line that is searched or cut in a pipe.
+    assert all(line == line.rstrip() for line in lines)
+
+
+@pytest.mark.parametrize(("width", "count"), [(12, 3), (16, 3), (24, 3), (40, 3)])
+def test_runs_over_one_setting_are_told_apart_among_others(width, count):
+    others = ["armless_humanoid-hidden", "humanoid-none"]
+    short = shorten([*RATES, *others], width)
+    assert len(set(short)) == count + len(others)
+    assert all("…" in name for name in short[:3])
+    if width >= 24:
+        assert ["1e-05" in short[0], "0.0003" in short[1], "0.003" in short[2]] == [True] * 3
+
+
+@given(st.lists(st.text("abc-= /0", min_size=1, max_size=30), max_size=12), st.integers(4, 40))
+def test_short_names_fit_and_are_the_same_for_the_same_run(names, width):
+    short = shorten(names, width)
+    assert all(len(name) <= width for name in short)
+    assert len(set(zip(names, short, strict=True))) == len(set(names))
+    if all(len(name) <= width for name in names):
+        assert short == names
+
+
+def test_names_that_end_differently_are_told_apart_down_to_four_characters():
+    names = [f"armless_humanoid-{'x' * 30}{letter}" for letter in "abcdefg"]
+    for width in range(4, 50):
+        assert len(set(shorten(names, width))) == len(names)
+
+
+def test_reasons_are_told_once_and_not_read_as_markup():
+    alike = [status(f"run{number}", BLOCKED, reason="waits for its teacher") for number in range(3)]
+    lines = [line.plain for line in reasons([*VIEWS, status("other", LOST, reason="gone"), *alike])]
+    assert lines == [
+        "failed  H0  [bold]humanoid[/bold] seed 1: RuntimeError: the cart [0] has no wheels",
+        "lost  other seed 1: gone",
+        "blocked  3 runs: waits for its teacher",
+    ]
+
+
+def some_runs(folder: Path) -> list[str]:
+    """The command that looks at them."""
+    for name in RATES[:2]:
+        heartbeat(folder / "quick" / name / "seed_1", process=1, host="elsewhere")
+    ended(folder / "quick" / RATES[2] / "seed_1")
+    return [sys.executable, "-m", "sweeps.status", str(folder)]
+
+
+def test_what_goes_through_a_pipe_is_not_cropped(tmp_path):
+    told = subprocess.run(some_runs(tmp_path), capture_output=True, text=True, check=True)
+    assert told.stdout.count("\n") == 5
+    assert all(f"quick/{name}  " in told.stdout for name in RATES)
+    assert "\x1b" not in told.stdout
+
+
+@pytest.mark.parametrize("width", [40, 80, 120])
+def test_make_status_fits_a_real_terminal(tmp_path, width):
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, width, 0, 0))
+    variables = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "LINES", "NO_COLOR")}
+    process = subprocess.Popen(
+        some_runs(tmp_path), stdin=theirs, stdout=theirs, stderr=theirs, env={**variables, "TERM": "xterm"}
+    )
+    os.close(theirs)
+    said = b""
+    # Linux ends a terminal that nobody writes to any more with an error.
+    try:
+        while part := os.read(ours, 65536):
+            said += part
+    except OSError:
+        pass
+    os.close(ours)
+    assert process.wait() == 0, said
+    assert b"\x1b[36m" in said, "what runs is colored"
+    header, *lines, _ = Text.from_ansi(said.decode().replace("\r", "")).plain.splitlines()
+    assert (header.split()[0], header.split()[-1]) == ("run", "return")
+    assert [sorted({"running", "complete"} & set(line.split())) for line in lines] == [
+        ["running"], ["complete"], ["running"]
+    ]  # fmt: skip
+    assert all(len(line) <= width for line in lines)
+    assert len({line.split()[0] for line in lines}) == 3
