@@ -24,7 +24,6 @@ HORIZON, THRESHOLD = "horizon", "threshold"
 #: Settings that can only cut a run short: what it does until then stays the same, and so does the paper's cell.
 STOP_KEYS = ("stop", "stop_after")
 
-TRACKING_MODES = ("off", "offline", "self_hosted")
 PROGRESS_MODES = ("auto", "bar", "lines", "off")
 #: How matrix products are computed.
 PRECISIONS = ("float32", "bfloat16")
@@ -122,14 +121,18 @@ class TransferConfig:
 
 @dataclass
 class TrackingConfig:
-    """Where Weights & Biases mirrors a run."""
+    """What shows a run while it goes on, besides its own files."""
 
-    mode: str = "offline"
+    #: The class that is told how the run goes (docs/howto-tracking.md); None: none.
+    tracker: str | None = "acmr.tracking.wandb_tracker.WandbTracker"
     project: str = "acmr"
     entity: str | None = None
+    #: Address of a W&B server; None: offline.
     base_url: str | None = None
     #: Folder of the offline runs; None: ``<output_dir>/wandb``.
     dir: str | None = None
+    #: Free room for the settings of trackers that are added.
+    options: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass

@@ -24,6 +24,7 @@ from acmr.records import EpisodeInProgress
 from acmr.run.random_streams import random_streams
 from acmr.run.trainer import Trainer
 from acmr.settings.compose import compose_config, parse
+from acmr.tracking.observer import Observer
 
 Steps = Callable[[int], None]
 LEARNING_STARTS = 300
@@ -67,8 +68,8 @@ def ours_with_environment(*overrides: str) -> tuple[Steps, gym.Env]:
     buffer = ReplayBuffer(config.agent.buffer_size, dims.observation, dims.action)
     episode = EpisodeInProgress(about.reward_terms, about.has_forward_velocity)
 
-    def train(on_step: Callable[[int], None]) -> None:
-        Trainer(env, agent, buffer, streams, 10**9, config.log_every, episode, on_step=on_step).train()
+    def train(pause: Observer) -> None:
+        Trainer(env, agent, buffer, streams, 10**9, config.log_every, episode, observers=[pause]).train()
 
     run, precision = _Paused(train), choose_products(config.agent).precision
 
@@ -121,13 +122,13 @@ def _discard(model: object) -> None:
     pass
 
 
-class _Paused:
+class _Paused(Observer):
     """Runs a training loop in a thread that goes on only while somebody waits for its steps."""
 
-    def __init__(self, train: Callable[[Callable[[int], None]], None]) -> None:
+    def __init__(self, train: Callable[[Observer], None]) -> None:
         self._go, self._done = threading.Semaphore(0), threading.Semaphore(0)
         self._left = 0
-        self._thread = threading.Thread(target=lambda: train(self._on_step), daemon=True)
+        self._thread = threading.Thread(target=lambda: train(self), daemon=True)
         self._started = False
 
     def steps(self, count: int) -> None:
@@ -141,7 +142,7 @@ class _Paused:
             if not self._thread.is_alive():
                 raise RuntimeError("the training loop ended")
 
-    def _on_step(self, global_step: int) -> None:
+    def on_step(self, step: int) -> None:
         self._left -= 1
         if self._left == 0:
             self._done.release()

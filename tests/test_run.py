@@ -148,6 +148,7 @@ def test_a_teacher_by_path(seven, tmp_path):
         (["experiment=A2", "transfer.teacher=nowhere"], "no such teacher file"),
         (["env=gym", "env.id=Hoper-v5"], "Hopper-v5"),
         (["device=tpu"], "must be cpu or cuda"),
+        (["tracking.tracker=acmr.nowhere.Tracker"], "no such class (ModuleNotFoundError: No module named"),
         (["output_dir=/dev/null/x"], "cannot be written"),
     ],
 )

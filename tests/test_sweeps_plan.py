@@ -113,7 +113,7 @@ def test_a_teacher_is_trained_the_way_its_student_is(out):
     made = plan([out, "transfer=hidden", "tracking=off", "threads=2", "progress=off"])
     assert made.runs[0].implied
     config = made.runs[0].spec.config
-    assert (config.tracking.mode, config.threads, config.progress) == ("off", 2, "off")
+    assert (config.tracking.tracker, config.threads, config.progress) == (None, 2, "off")
     assert made.runs[0].spec.directory == plan([out, "env=humanoid"]).runs[0].spec.directory
 
 

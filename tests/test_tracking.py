@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 import yaml
-from tracking_tools import ID, RUN, SETTINGS, history, inspect, records, start, the_mirror
+from tracking_tools import ID, RUN, history, inspect, records, spec, start, the_mirror
 
-from acmr.config import ConfigError, TrackingConfig
+from acmr.config import ConfigError
 from acmr.records import EpisodeRecord
 from acmr.tracking.mirror import main, rebuild
 from acmr.tracking.wandb_backend import linked_mirrors, run_id
-from acmr.tracking.wandb_tracker import _label, labels
+from acmr.tracking.wandb_tracker import labels, short_name
 
 EPISODE = EpisodeRecord(120, 71.25, 120, 0.5, {"reward_forward": 3.5, "reward_ctrl": -1.0})
 EPISODE_ROW = {
@@ -34,10 +34,10 @@ def test_an_offline_run_read_back(tmp_path: Path) -> None:
     warnings: list[str] = []
     state, variables = random.getstate(), dict(os.environ)
     tracker = start(tmp_path, warnings)
-    tracker.episode(EPISODE)
-    tracker.episode(EpisodeRecord(250, -1.0, 130))
-    tracker.metrics(1000, {"critic_loss": 0.5, "alpha": 0.2})
-    tracker.finish({"status": "complete", "steps_to_threshold": None, "versions": {"torch": "2.13"}})
+    tracker.on_episode(EPISODE)
+    tracker.on_episode(EpisodeRecord(250, -1.0, 130))
+    tracker.on_metrics(1000, {"critic_loss": 0.5, "alpha": 0.2})
+    tracker.close({"status": "complete", "steps_to_threshold": None, "versions": {"torch": "2.13"}})
     assert warnings == []
     assert random.getstate() == state
     assert dict(os.environ) == variables
@@ -51,7 +51,7 @@ def test_an_offline_run_read_back(tmp_path: Path) -> None:
     assert config["group"] == "quick/A2"
     assert config["job_type"] == "student"
     assert set(config["tags"]) == set(run["tags"])
-    assert config["agent"] == SETTINGS["agent"]
+    assert config["agent"] == spec(tmp_path).settings["agent"]
     assert config["seed"] == 3
     assert history(mirror) == [
         EPISODE_ROW,
@@ -75,8 +75,8 @@ def test_a_repeated_run_shows_once_and_its_neighbours_stay(tmp_path: Path) -> No
         (folder / name).mkdir(parents=True)
     for value in (1.0, 2.0):  # in one process, as a worker that is used again does
         tracker = start(tmp_path, warnings)
-        tracker.episode(EpisodeRecord(10, value, 10))
-        tracker.finish(None, exit_code=1)
+        tracker.on_episode(EpisodeRecord(10, value, 10))
+        tracker.close(None)
     assert warnings == []
     mirror = the_mirror(tmp_path)
     assert [row["episodic_return"] for row in history(mirror)] == [2]
@@ -87,7 +87,7 @@ def test_a_repeated_run_shows_once_and_its_neighbours_stay(tmp_path: Path) -> No
 
 def test_the_dashboard_lists_short_names(tmp_path: Path) -> None:
     folder, links = tmp_path / "wandb", tmp_path / "wandb" / "by_name"
-    start(tmp_path, []).finish(None)
+    start(tmp_path, []).close(None)
     mirror = the_mirror(tmp_path)
     started = mirror.name.split("-")[2]
     (shown,) = links.iterdir()
@@ -105,7 +105,7 @@ def test_the_dashboard_lists_short_names(tmp_path: Path) -> None:
 def make_run(run_dir: Path) -> list[dict[str, float]]:
     """A run's files; returns the rows that its mirror must hold."""
     run_dir.mkdir(parents=True)
-    (run_dir / "config.yaml").write_text(yaml.safe_dump(SETTINGS))
+    (run_dir / "config.yaml").write_text(yaml.safe_dump(spec("elsewhere").settings))
     rng = random.Random(0)
     episodes = [
         {
@@ -129,7 +129,7 @@ def test_a_mirror_is_rebuilt_from_the_runs_own_files(tmp_path: Path) -> None:
     run_dir = tmp_path / "quick" / RUN / "seed_3"
     expected = make_run(run_dir)
     warnings: list[str] = []
-    rebuild(run_dir, warnings.append)
+    rebuild(run_dir, "offline", warnings.append)
     first = the_mirror(tmp_path)
     assert history(first) == expected
     assert records(first)[-1]["exit"]["exit_code"] == 1  # unfinished: killed, or still running
@@ -147,7 +147,7 @@ def test_a_mirror_is_rebuilt_from_the_runs_own_files(tmp_path: Path) -> None:
 
 def test_rebuild_of_what_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ConfigError, match="is no run's directory"):
-        rebuild(tmp_path, print)
+        rebuild(tmp_path, "offline", print)
     (tmp_path / "config.yaml").write_text("just text")
     assert main(["rebuild", str(tmp_path)]) == 2
     assert main(["dashboard", str(tmp_path)]) == 2
@@ -157,22 +157,19 @@ def test_rebuild_of_what_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 def test_run_ids_are_readable_stable_and_distinct(tmp_path: Path) -> None:
-    config, other = TrackingConfig(), TrackingConfig(dir=str(tmp_path / "all"))
-    assert run_id(config, tmp_path, "paper", "armless_humanoid-hidden-frozen", 3) == (
-        "paper-armless_humanoid-hidden-frozen-s3"
-    )
+    assert run_id(spec(tmp_path)) == "quick-ant_three_legs-hidden-frozen-s3"
     names = ["ant-none-q_lr=0.0001", "ant-none-a[1]", "ant-none-a(1)", "x" * 300, "x" * 301]
-    ids = [run_id(config, tmp_path, "quick", name, 1) for name in names]
+    ids = [run_id(spec(tmp_path, name)) for name in names]
     assert len(set(ids)) == len(names)
     assert all(len(name) <= 128 and not set(name) & set("/\\#?%:[]()") for name in ids)
-    shared = {run_id(other, tmp_path / folder, "quick", "ant-none", 1) for folder in ("runs", "more")}
+    shared = {run_id(spec(tmp_path / folder, dir=str(tmp_path / "all"))) for folder in ("runs", "more")}
     assert len(shared) == 2
 
 
 def test_a_run_that_stops_at_its_threshold_is_of_its_cell_but_not_averaged_with_full_ones() -> None:
-    full, stopped = SETTINGS, {**SETTINGS, "stop": "threshold"}
     name = f"{RUN}-stop=threshold"
-    assert labels(full, RUN, "A2")["group"] == "quick/A2"
-    assert labels(stopped, name, "A2")["group"] == f"quick/{name}"
-    assert labels(stopped, name, "A2")["tags"] == [*labels(full, RUN, "A2")["tags"], "stopped"]
-    assert _label("quick", name, 3, labels(stopped, name, "A2")["tags"]) == "A2-s3-quick-stopped"
+    full, stopped = spec("runs"), spec("runs", name, stop="threshold")
+    assert labels(full)["group"] == "quick/A2"
+    assert labels(stopped)["group"] == f"quick/{name}"
+    assert labels(stopped)["tags"] == [*labels(full)["tags"], "stopped"]
+    assert short_name(stopped) == "A2-s3-quick-stopped"

@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tracking_tools import ID, RUN, spec
 
-from acmr.config import TrackingConfig
 from acmr.records import EpisodeRecord
-from acmr.tracking import wandb_backend, wandb_tracker
+from acmr.tracking import wandb_backend
 from acmr.tracking.mirror import main, unsent
-from acmr.tracking.wandb_tracker import Tracker, make_tracker
+from acmr.tracking.observer import Observer
+from acmr.tracking.watchers import make_tracker
 
 KEY = "k" * 40
-NAME = "quick-ant-none-s1"
 
 
 class Server(ThreadingHTTPServer):
@@ -120,24 +120,13 @@ def _key(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_API_KEY", KEY)
 
 
-def start(output_dir: Path, warnings: list[str], url: str | None = None, name: str = "ant-none") -> Tracker:
-    return make_tracker(
-        TrackingConfig(mode="self_hosted" if url else "offline", base_url=url),
-        output_dir=output_dir,
-        run_name=name,
-        profile="quick",
-        seed=1,
-        group="quick/A0",
-        job_type="student",
-        tags=["A0", "ant"],
-        settings={"seed": 1, "agent": {"q_lr": 0.001}},
-        warn=warnings.append,
-    )
+def start(output_dir: Path, warnings: list[str], url: str | None = None, name: str = RUN) -> Observer:
+    return make_tracker(spec(output_dir, name, base_url=url), warnings.append)
 
 
-def log(tracker: Tracker, rows: int) -> list[dict[str, Any]]:
+def log(tracker: Observer, rows: int) -> list[dict[str, Any]]:
     for step in range(1, rows + 1):
-        tracker.episode(EpisodeRecord(step * 10, step / 7, 10))
+        tracker.on_episode(EpisodeRecord(step * 10, step / 7, 10))
     return [
         {"global_step": step * 10, "episodic_return": step / 7, "episode_length": 10} for step in range(1, rows + 1)
     ]
@@ -157,26 +146,27 @@ def test_sync_sends_every_row_once(
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
     expected = {}
-    for name, rows in (("ant-none", 300), ("ant-hidden", 5)):
+    for name, rows in ((RUN, 300), ("ant-hidden", 5)):
         tracker = start(tmp_path, warnings, name=name)
-        expected[f"quick-{name}-s1"] = log(tracker, rows)
-        tracker.finish({"status": "complete"})
+        expected[f"quick-{name}-s3"] = log(tracker, rows)
+        tracker.close({"status": "complete"})
     command = ["sync", "--base-url", server.url, str(folder)]
     assert main(command) == 0
     assert capfd.readouterr().out.endswith(f"2 runs sent to {server.url}\n")
     assert {run: server.history(run) for run in expected} == expected
-    about = server.runs[NAME]
-    assert (about["groupName"], about["jobType"], sorted(about["tags"])) == ("quick/A0", "student", ["A0", "ant"])
-    assert json.loads(about["config"])["agent"]["value"] == {"q_lr": 0.001}
+    about = server.runs[ID]
+    assert (about["groupName"], about["jobType"]) == ("quick/A2", "student")
+    assert set(about["tags"]) >= {"A2", "ant_three_legs"}
+    assert json.loads(about["config"])["agent"]["value"]["q_lr"] == 0.001
     # Sent is sent; a run that was repeated since is not.
     server.rows.clear()
     assert main(command) == 0
     assert not server.rows
     repeated = start(tmp_path, warnings)
     expected_again = log(repeated, 3)
-    repeated.finish(None)
+    repeated.close(None)
     assert main(command) == 0
-    assert {run: server.history(run) for run in server.rows} == {NAME: expected_again}
+    assert {run: server.history(run) for run in server.rows} == {ID: expected_again}
     assert warnings == []
     assert list(elsewhere.iterdir()) == []
 
@@ -186,12 +176,12 @@ def test_a_server_is_mirrored_to_at_once(tmp_path: Path, server: Server) -> None
     tracker = start(tmp_path, warnings, server.url)
     expected = log(tracker, 20)
     until = time.monotonic() + 20
-    while len(server.rows[NAME]) < 20 and time.monotonic() < until:
+    while len(server.rows[ID]) < 20 and time.monotonic() < until:
         time.sleep(0.1)
-    before_the_end = server.history(NAME)
-    tracker.finish({"status": "complete"})
-    assert before_the_end == server.history(NAME) == expected
-    assert server.runs[NAME]["groupName"] == "quick/A0"
+    before_the_end = server.history(ID)
+    tracker.close({"status": "complete"})
+    assert before_the_end == server.history(ID) == expected
+    assert server.runs[ID]["groupName"] == "quick/A2"
     assert unsent(tmp_path / "wandb") == []
     assert warnings == []
 
@@ -220,7 +210,7 @@ def test_no_server_means_offline_with_one_warning(
     tracker = start(tmp_path, warnings, url)
     assert time.monotonic() - began < 6
     log(tracker, 5)
-    tracker.finish(None)
+    tracker.close(None)
     for stop in stops:
         stop()
     (warning,) = warnings
@@ -233,7 +223,7 @@ def test_no_server_means_offline_with_one_warning(
     late = Server()
     monkeypatch.setenv("WANDB_API_KEY", KEY)
     assert main(["sync", "--base-url", late.url, str(tmp_path / "wandb")]) == 0
-    assert len(late.history(NAME)) == 5
+    assert len(late.history(ID)) == 5
     late.stop()
 
 
@@ -241,21 +231,20 @@ def test_a_server_that_goes_away_delays_nothing_and_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(wandb_backend, "SERVER_WAIT", 2.0)
-    monkeypatch.setattr(wandb_tracker, "SERVER_WAIT", 2.0)
     first, warnings = Server(), list[str]()
     tracker = start(tmp_path, warnings, first.url)
-    tracker.metrics(1, {"alpha": 0.5})
+    tracker.on_metrics(1, {"alpha": 0.5})
     first.stop()
     began = time.monotonic()
     expected = [{"global_step": 1, "alpha": 0.5}, *log(tracker, 200)]
     assert time.monotonic() - began < 2
-    tracker.finish({"status": "complete"})
+    tracker.close({"status": "complete"})
     assert time.monotonic() - began < 8
     (warning,) = warnings
     assert "did not take everything within 2 s; `make sync` sends the rest" in warning
     second = Server()
     assert main(["sync", "--base-url", second.url, str(tmp_path / "wandb")]) == 0
-    assert second.history(NAME) == expected
+    assert second.history(ID) == expected
     second.stop()
 
 
@@ -264,7 +253,7 @@ def test_sync_that_cannot_be_done_says_why_in_one_line(
 ) -> None:
     folder = str(tmp_path / "wandb")
     assert main(["sync", "--base-url", "http://127.0.0.1:9", folder]) == 2
-    start(tmp_path, []).finish(None)
+    start(tmp_path, []).close(None)
     assert main(["sync", "--base-url", "", folder]) == 2
     assert main(["sync", "--base-url", closed_port(), folder]) == 2
     monkeypatch.delenv("WANDB_API_KEY")

@@ -27,9 +27,8 @@ from acmr.config import ConfigError
 from acmr.envs import make_env
 from acmr.envs.state import ResumeCheck, rehearse
 from acmr.run import reproducibility, summary
-from acmr.run.checkpointing import Checkpoints
+from acmr.run.checkpointing import Checkpoints, CheckpointSchedule
 from acmr.run.preparation import Prepared, prepare
-from acmr.run.run_logs import Recorder
 from acmr.run.run_state import RunState
 from acmr.run.stop_signals import StopSignals
 from acmr.settings.compose import compose_config, parse
@@ -215,18 +214,18 @@ def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def at_step(step: int, action: Callable[[], None] = die) -> Callable[[], None]:
+def at_step(number: int, action: Callable[[], None] = die) -> Callable[[], None]:
     """Something that happens within a step, before a checkpoint of it could be made."""
 
     def prepare() -> None:
-        before = Recorder.step
+        before = CheckpointSchedule.on_step
 
-        def watched(recorder: Recorder, global_step: int) -> None:
-            before(recorder, global_step)
-            if global_step == step:
+        def watched(schedule: CheckpointSchedule, step: int) -> None:
+            if step == number:
                 action()
+            before(schedule, step)
 
-        Recorder.step = watched
+        CheckpointSchedule.on_step = watched
 
     return prepare
 

@@ -11,53 +11,50 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wandb.util import get_core_path
-
-from acmr.config import TrackingConfig
+from acmr.config import EnvConfig, ExperimentConfig, SACConfig, TrackingConfig, TransferConfig
+from acmr.settings.run_spec import RunSpec
+from acmr.tracking.observer import Observer
 from acmr.tracking.wandb_backend import mirrors_of
-from acmr.tracking.wandb_tracker import Tracker, labels, make_tracker
+from acmr.tracking.watchers import make_tracker
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN = "ant_three_legs-hidden-frozen"
 ID = f"quick-{RUN}-s3"
-SETTINGS: dict[str, Any] = {
-    "seed": 3,
-    "freeze": True,
-    "profile": "quick",
-    "env": {"name": "ant_three_legs", "source": "ant"},
-    "transfer": {"name": "hidden"},
-    "agent": {"hidden_sizes": [64, 64], "q_lr": 0.001},
-    "tracking": {"mode": "offline", "project": "acmr", "entity": None, "base_url": None, "dir": None},
-}
 #: What a child process begins with: a tracker in the folder that is its argument, its warnings on standard output.
-CHILD = f"""
+CHILD = """
 import os, signal, subprocess, sys, time
 from pathlib import Path
-from acmr.config import TrackingConfig
 from acmr.records import EpisodeRecord
-from acmr.tracking.wandb_tracker import make_tracker
-settings = {SETTINGS!r}
-def start(mode="offline", folder=sys.argv[1]):
-    return make_tracker(TrackingConfig(mode=mode), output_dir=Path(folder), run_name={RUN!r}, profile="quick", seed=3,
-        group="g", job_type="student", tags=["A2"], settings=settings, warn=lambda line: print("WARNING", line))
+from tracking_tools import OFF, OFFLINE, make_tracker, spec
+def start(tracker=OFFLINE, folder=sys.argv[1]):
+    return make_tracker(spec(folder, tracker=tracker), lambda line: print("WARNING", line))
 def service():
     listed = subprocess.run(["ps", "-o", "pid=,comm=", "--ppid", str(os.getpid())], capture_output=True, text=True)
     return [int(line.split()[0]) for line in listed.stdout.splitlines() if "wandb-core" in line]
 """
+OFFLINE, OFF = TrackingConfig().tracker, None
 
 
-def start(output_dir: Path, warnings: list[str], **config: Any) -> Tracker:
-    words = labels(SETTINGS, RUN, "A2")
-    return make_tracker(
-        TrackingConfig(**config),
-        output_dir=output_dir,
-        run_name=RUN,
-        profile="quick",
+def spec(
+    output_dir: Path | str, name: str = RUN, cell: str | None = "A2", stop: str = "horizon", **tracking: Any
+) -> RunSpec:
+    """A cell of the quick profile."""
+    config = ExperimentConfig(
         seed=3,
-        settings=SETTINGS,
-        warn=warnings.append,
-        **words,
+        freeze=True,
+        stop=stop,
+        profile="quick",
+        output_dir=str(output_dir),
+        env=EnvConfig(name="ant_three_legs", id="Ant-v5", source="ant"),
+        transfer=TransferConfig(name="hidden"),
+        agent=SACConfig(hidden_sizes=[64, 64], q_lr=0.001),
+        tracking=TrackingConfig(**tracking),
     )
+    return RunSpec(config, {}, name, cell)
+
+
+def start(output_dir: Path, warnings: list[str], **tracking: Any) -> Observer:
+    return make_tracker(spec(output_dir, **tracking), warnings.append)
 
 
 def records(mirror: Path) -> list[dict[str, Any]]:
@@ -67,6 +64,8 @@ def records(mirror: Path) -> list[dict[str, Any]]:
 
 def inspect(mirror: Path, *options: str) -> str:
     """What ``wandb leet inspect --json`` prints, without the seconds that importing wandb takes."""
+    from wandb.util import get_core_path  # here, so that a child process need not load it
+
     (file,) = mirror.glob("run-*.wandb")
     command = [get_core_path(), "leet", "inspect", "--no-observability", *options, "--json", "--run-file", str(file)]
     return subprocess.run([*command, str(mirror.parent)], capture_output=True, text=True, check=True).stdout
@@ -82,7 +81,7 @@ def child(
     program: str, *arguments: object, home: Path, variables: Mapping[str, str] | None = None
 ) -> subprocess.Popen[str]:
     command = [sys.executable, "-c", CHILD + textwrap.dedent(program), *map(str, arguments)]
-    environment = {**os.environ, "HOME": str(home), "PYTHONPATH": str(ROOT), **(variables or {})}
+    environment = {**os.environ, "HOME": str(home), "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", **(variables or {})}
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 

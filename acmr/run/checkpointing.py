@@ -18,6 +18,7 @@ from acmr.run.stop_signals import Stopped, StopSignals
 from acmr.run.trainer import is_finite
 from acmr.storage.checkpoint_store import KEPT, SnapshotStore
 from acmr.storage.durable import FileDigest
+from acmr.tracking.observer import Observer
 
 #: Steps between two checkpoints where none are set: a share of the run, within these bounds.
 _SHARE, _LEAST, _MOST = 20, 1_000, 25_000
@@ -156,7 +157,7 @@ class Checkpoints:
         return str(self._store.state_file(step))
 
 
-class CheckpointSchedule:
+class CheckpointSchedule(Observer):
     """Decides after each step whether a checkpoint is made, and whether the run stops.
 
     Args:
@@ -185,14 +186,14 @@ class CheckpointSchedule:
         self._earliest = 0.0
         self._due_at = self._next_multiple()
 
-    def after_step(self, global_step: int) -> None:
+    def on_step(self, step: int) -> None:
         """Makes a checkpoint if it is due.
 
         Raises:
             Stopped: If the run was asked to stop, with a checkpoint where that is possible.
             WriteError: If the disk does not take it; the one before is good still.
         """
-        if (global_step < self._due_at and self._stop.received is None) or self._trainer.is_over:
+        if (step < self._due_at and self._stop.received is None) or self._trainer.is_over:
             return
         possible = self._makes_any and (self._anytime or self._trainer.observation is None)
         if self._stop.received is not None:

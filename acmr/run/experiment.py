@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,7 +21,7 @@ from acmr.records import DIVERGED, EpisodeInProgress
 from acmr.run.checkpointing import CheckpointKey, Checkpoints, CheckpointSchedule
 from acmr.run.preparation import Prepared, arrays_bytes, check_space, prepare
 from acmr.run.reproducibility import fingerprint
-from acmr.run.run_logs import Recorder, RunLogs
+from acmr.run.run_logs import RunLogs
 from acmr.run.run_state import RunState
 from acmr.run.stop_signals import StopSignals
 from acmr.run.summary import describe_teacher, reached, summarize
@@ -31,10 +30,8 @@ from acmr.settings.run_spec import RunSpec
 from acmr.storage.checkpoint_store import SnapshotStore
 from acmr.storage.durable import StorageError, WriteError
 from acmr.storage.run_dir import RunDir, RunHeldError, holds_run
-from acmr.tracking.mirror import replay
-from acmr.tracking.progress import RunProgress, make_progress
-from acmr.tracking.status_file import Heartbeat
-from acmr.tracking.wandb_tracker import Tracker, labels, make_tracker
+from acmr.tracking.observer import close_all
+from acmr.tracking.watchers import make_watchers
 from acmr.transfer.teacher import save_teacher
 
 
@@ -162,31 +159,28 @@ class Session:
 
     def _train(self, checkpoints: Checkpoints, state: RunState) -> dict[str, Any]:
         spec, trainer, run_dir = self.prepared.spec, state.trainer, self.run_dir
-        heartbeat = Heartbeat(run_dir.path, trainer.total_timesteps, trainer.global_step)
-        tracker = _tracker(spec, self.say)
-        replay(tracker, run_dir.path)
-        recorder = Recorder(state.logs, tracker, _progress(spec, trainer.global_step), heartbeat)
-        keeper = CheckpointSchedule(
+        schedule = CheckpointSchedule(
             checkpoints, state, spec.config.checkpoint_every, self.rehearsal.when, self.stop, self.say
         )
-
-        def after_step(global_step: int) -> None:
-            recorder.step(global_step)
-            keeper.after_step(global_step)
-
-        trainer.on_step, trainer.on_episode, trainer.on_metrics = after_step, recorder.episode, recorder.metrics
-        summary: dict[str, Any] | None = None
+        # The run's own record comes first, whatever becomes of those that show it; a checkpoint of a step holds all of
+        # that step, so its schedule comes last.
+        watchers = make_watchers(spec, trainer.global_step, self.say)
+        trainer.observers = [state.logs, *watchers, schedule]
         try:
             state.start_clock()
-            made = self._summary(checkpoints, state, _train(trainer))
-            if made["status"] != DIVERGED:
-                description = describe_teacher(spec, self.prepared.about, trainer.agent, made)
+            summary = self._summary(checkpoints, state, _train(trainer))
+            if summary["status"] != DIVERGED:
+                description = describe_teacher(spec, self.prepared.about, trainer.agent, summary)
                 save_teacher(run_dir.path, trainer.agent.networks, description)
-            # Last: a run with a summary is finished.
-            run_dir.write_json(run_dir.summary_file, made)
-            summary = made
-        finally:
-            recorder.close(summary)
+            # Every row is on the disk before anything says that the run is finished, and a run with a summary is.
+            state.logs.marks()
+            run_dir.write_json(run_dir.summary_file, summary)
+        except BaseException:
+            # What ended the run matters more than what closing may raise.
+            with suppress(Exception):
+                close_all(trainer.observers, None)
+            raise
+        close_all(trainer.observers, summary)
         if summary["physics_warnings"]:
             counts = ", ".join(f"{count:,} x {kind}" for kind, count in summary["physics_warnings"].items())
             self.say(f"{run_dir}: MuJoCo warned of the simulation: {counts}")
@@ -241,30 +235,3 @@ def _train(trainer: Trainer) -> DivergedError | None:
     except DivergedError as error:
         return error
     return None
-
-
-def _tracker(spec: RunSpec, say: Callable[[str], None]) -> Tracker:
-    config = spec.config
-    return make_tracker(
-        config.tracking,
-        output_dir=Path(config.output_dir),
-        run_name=spec.name,
-        profile=config.profile,
-        seed=config.seed,
-        settings=spec.settings,
-        warn=say,
-        **labels(spec.settings, spec.name, spec.cell),
-    )
-
-
-def _progress(spec: RunSpec, start_step: int) -> RunProgress:
-    config = spec.config
-    return make_progress(
-        config.progress,
-        total_timesteps=config.most_steps,
-        threshold=config.threshold,
-        consecutive=config.consecutive,
-        stops=config.stop == THRESHOLD,
-        title=" ".join([*([spec.cell] if spec.cell else []), spec.name, f"seed {config.seed}"]),
-        start_step=start_step,
-    )

@@ -20,6 +20,7 @@ from acmr.settings.run_spec import RunSpec, teacher_spec
 from acmr.storage.checkpoint_store import KEPT
 from acmr.storage.run_dir import RunDir
 from acmr.text import size
+from acmr.tracking.watchers import tracker_class
 from acmr.transfer.methods import check_body, transfer
 from acmr.transfer.report import TransferReport
 from acmr.transfer.teacher import Teacher, load_teacher
@@ -44,6 +45,7 @@ def prepare(spec: RunSpec) -> Prepared:
     """Builds the networks that a run starts with, with everything its teacher gives."""
     config = spec.config
     _check_device(config.device)
+    tracker_class(config.tracking)
     about = describe(config.env)
     dims = Dimensions(len(about.observation_names), len(about.action_names))
     teacher = find_teacher(config, dims)

@@ -1,17 +1,17 @@
-"""Everything that is told of a run while it goes on: its own files, its W&B mirror and the progress bar."""
+"""``episodes.csv`` and ``metrics.csv``: the run's own record, which everything that shows or analyzes it is made of."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from acmr.agent.sac import METRIC_NAMES
 from acmr.envs import EnvDescription
 from acmr.records import (
     EPISODE_COLUMNS,
     METRIC_COLUMNS,
-    STOPPED,
     VELOCITY_COLUMN,
     DamagedError,
     EpisodeRecord,
@@ -20,14 +20,12 @@ from acmr.records import (
 from acmr.storage.csv_log import CsvLog
 from acmr.storage.durable import FileDigest
 from acmr.storage.run_dir import RunDir
-from acmr.tracking.progress import RunProgress
-from acmr.tracking.status_file import Heartbeat
-from acmr.tracking.wandb_tracker import Tracker
+from acmr.tracking.observer import Observer
 
 _METRIC_COLUMNS = (*METRIC_COLUMNS, *METRIC_NAMES)
 
 
-class RunLogs:
+class RunLogs(Observer):
     """``episodes.csv`` and ``metrics.csv``; creating the object touches no disk.
 
     Args:
@@ -59,17 +57,17 @@ class RunLogs:
         self._open({name: marks[name] for name in ("episodes", "metrics")})
         self.history = self._read_episodes(self._run_dir.episodes_file)
 
-    def episode(self, record: EpisodeRecord) -> None:
-        """Records an episode that has ended."""
+    def on_episode(self, record: EpisodeRecord) -> None:
+        """Appends a row to ``episodes.csv``."""
         self.history.append(record)
         velocity = [record.mean_forward_velocity] if self._about.has_forward_velocity else []
         terms = [record.reward_terms[name] for name in self._about.reward_terms]
         row = [record.global_step, record.episodic_return, record.episode_length, *velocity, *terms]
         self._logs["episodes"].row(row)
 
-    def metrics(self, global_step: int, values: Mapping[str, float]) -> None:
-        """Records means over the last steps."""
-        self._logs["metrics"].row([global_step, *(values[name] for name in _METRIC_COLUMNS[1:])])
+    def on_metrics(self, step: int, values: Mapping[str, float]) -> None:
+        """Appends a row to ``metrics.csv``."""
+        self._logs["metrics"].row([step, *(values[name] for name in _METRIC_COLUMNS[1:])])
 
     def meet(self, threshold: float, consecutive: int) -> bool:
         """Whether the latest ``consecutive`` episodes have all returned at least ``threshold``."""
@@ -80,11 +78,11 @@ class RunLogs:
         """Waits until every row is on the disk, and says what each file holds."""
         return {name: log.mark() for name, log in self._logs.items()}
 
-    def close(self) -> None:
-        """Closes both files."""
-        for log in self._logs.values():
+    def close(self, summary: Mapping[str, Any] | None = None) -> None:
+        """Closes both files; where they are closed already, does nothing."""
+        logs, self._logs = self._logs, {}
+        for log in logs.values():
             log.close()
-        self._logs = {}
 
     def _open(self, marks: Mapping[str, FileDigest]) -> None:
         self.close()
@@ -110,44 +108,3 @@ class RunLogs:
             float(row[VELOCITY_COLUMN]) if self._about.has_forward_velocity else None,
             {name: float(row[name]) for name in self._about.reward_terms},
         )
-
-
-class Recorder:
-    """Passes episodes and metrics on as they come.
-
-    Args:
-        logs: The run's own files.
-        tracker: The run's mirror.
-        progress: What the user sees.
-        heartbeat: What others see.
-    """
-
-    def __init__(self, logs: RunLogs, tracker: Tracker, progress: RunProgress, heartbeat: Heartbeat) -> None:
-        self._logs, self._tracker, self._progress, self._heartbeat = logs, tracker, progress, heartbeat
-        for record in logs.history:
-            progress.episode(record)
-            heartbeat.episode(record.episodic_return)
-
-    def step(self, global_step: int) -> None:
-        """Notes one more step."""
-        self._progress.update(global_step)
-        self._heartbeat.step(global_step)
-
-    def episode(self, record: EpisodeRecord) -> None:
-        """Records an episode that has ended."""
-        self._logs.episode(record)
-        self._tracker.episode(record)
-        self._progress.episode(record)
-        self._heartbeat.episode(record.episodic_return)
-
-    def metrics(self, global_step: int, values: Mapping[str, float]) -> None:
-        """Records means over the last steps; ``values`` has ``steps_per_second`` and the learner's own."""
-        self._logs.metrics(global_step, values)
-        self._tracker.metrics(global_step, values)
-
-    def close(self, summary: Mapping[str, object] | None) -> None:
-        """Ends everything; without a summary the run did not come to its end."""
-        self._progress.close()
-        self._heartbeat.close(str(summary["status"]) if summary else STOPPED)
-        self._logs.close()
-        self._tracker.finish(summary, 0 if summary else 1)

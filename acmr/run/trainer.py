@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import gymnasium as gym
@@ -13,8 +13,9 @@ import torch
 
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.agent.sac import SAC
-from acmr.records import EpisodeInProgress, EpisodeRecord
+from acmr.records import EpisodeInProgress
 from acmr.run.random_streams import RandomStreams
+from acmr.tracking.observer import Observer
 
 
 class DivergedError(Exception):
@@ -28,10 +29,6 @@ class DivergedError(Exception):
     def __init__(self, step: int, cause: str) -> None:
         super().__init__(f"diverged at step {step:,}: {cause}")
         self.step, self.cause = step, cause
-
-
-def _ignore(*_: object) -> None:
-    """Does nothing with what it is told."""
 
 
 def _never() -> bool:
@@ -51,9 +48,7 @@ class Trainer:
         log_every: Environment steps between two rows of metrics.
         episode: Sums over the current episode.
         is_satisfied: Asked between two episodes whether the training may end before its last step.
-        on_step: Called when all of a step is done, with its number; what it raises ends the training.
-        on_episode: Called as each episode ends.
-        on_metrics: Called with the step, and means since the last call, ``steps_per_second`` among them.
+        observers: Told of every step, episode and row of metrics, in their order; what one raises ends the training.
         global_step: Environment steps taken.
         observation: What the next action answers; None between two episodes.
     """
@@ -66,9 +61,7 @@ class Trainer:
     log_every: int
     episode: EpisodeInProgress
     is_satisfied: Callable[[], bool] = _never
-    on_step: Callable[[int], None] = _ignore
-    on_episode: Callable[[EpisodeRecord], None] = _ignore
-    on_metrics: Callable[[int, dict[str, float]], None] = _ignore
+    observers: Sequence[Observer] = ()
     global_step: int = 0
     observation: np.ndarray | None = None
 
@@ -91,7 +84,8 @@ class Trainer:
                 now, (before, first) = time.perf_counter(), since
                 since = (now, self.global_step)
                 self._log((self.global_step - first) / (now - before))
-            self.on_step(self.global_step)
+            for observer in self.observers:
+                observer.on_step(self.global_step)
         self._check_learner()
 
     def _step(self) -> None:
@@ -112,7 +106,9 @@ class Trainer:
         self.buffer.add(observation, action, reward, next_observation, terminated, ended)
         self.observation = next_observation
         if ended:
-            self.on_episode(self.episode.record(self.global_step))
+            record = self.episode.record(self.global_step)
+            for observer in self.observers:
+                observer.on_episode(record)
             self.episode.restart()
             self.observation = None
         if not exploring:
@@ -120,7 +116,9 @@ class Trainer:
 
     def _log(self, speed: float) -> None:
         metrics = self.agent.metrics()
-        self.on_metrics(self.global_step, {"steps_per_second": speed, **metrics})
+        values = {"steps_per_second": speed, **metrics}
+        for observer in self.observers:
+            observer.on_metrics(self.global_step, values)
         if self.global_step > self.agent.config.learning_starts:
             self._check("the critics' loss", metrics["critic_loss"])
         self._check_learner()

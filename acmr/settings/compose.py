@@ -6,7 +6,7 @@ The border to Hydra: what leaves here are plain dataclasses.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, fields, is_dataclass
 from difflib import get_close_matches
@@ -21,12 +21,14 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue
+from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
 from acmr.config import ConfigError, EnvConfig, ExperimentConfig, flatten, schema_defaults
 from acmr.settings.validate import validate
 
 CONFIG_FOLDER = Path(__file__).resolve().parents[2] / "conf"
+#: What to type for settings that some files of ``conf/`` leave open (``???``).
+_EXAMPLES = {"env.id": "Hopper-v5", "tracking.base_url": "http://HOST:PORT"}
 
 
 def register_schema() -> None:
@@ -47,7 +49,7 @@ def parse(cfg: DictConfig) -> ExperimentConfig:
         # The one knows its own place; the other says the place that it leads to.
         own = isinstance(error, MissingMandatoryValue) and error.full_key
         key = own or str(error).strip().splitlines()[0].rpartition(": ")[2]
-        example = " (for example env.id=Hopper-v5)" if key == "env.id" else ""
+        example = f" (for example {key}={_EXAMPLES[key]})" if key in _EXAMPLES else ""
         raise ConfigError(f"{key} has no value: type {key}=VALUE{example}") from error
     assert isinstance(config, ExperimentConfig)
     validate(config)
@@ -97,6 +99,35 @@ def _refuse_unknown(node: DictConfig, prefix: str = "") -> None:
             raise ConfigError(unknown_key(f"{prefix}{key}"))
         if not OmegaConf.is_missing(node, key) and isinstance(node[key], DictConfig):
             _refuse_unknown(node[key], f"{prefix}{key}.")
+
+
+def stored_config(settings: object) -> ExperimentConfig:
+    """Types the content of a run's ``config.yaml``, whichever version of this program wrote it.
+
+    A setting that it lacks has the schema's default; one that the schema knows no more is left out.
+
+    Raises:
+        ConfigError: If these are no settings.
+    """
+    if not isinstance(settings, Mapping):
+        raise ConfigError("no settings")
+    try:
+        known = _known(ExperimentConfig(), settings)
+        config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ExperimentConfig), known))
+    except OmegaConfBaseException as error:
+        raise ConfigError(str(error).strip().splitlines()[0]) from error
+    assert isinstance(config, ExperimentConfig)
+    return config
+
+
+def _known(schema: Any, settings: Mapping[Any, Any]) -> dict[str, Any]:
+    known = {}
+    for entry in fields(schema):
+        if entry.name in settings:
+            value, default = settings[entry.name], getattr(schema, entry.name)
+            nested = is_dataclass(default) and isinstance(value, Mapping)
+            known[entry.name] = _known(default, value) if nested else value
+    return known
 
 
 def setting_keys() -> list[str]:

@@ -12,7 +12,6 @@ from acmr.config import (
     PRECISIONS,
     PROGRESS_MODES,
     THRESHOLD,
-    TRACKING_MODES,
     ConfigError,
     ExperimentConfig,
 )
@@ -52,12 +51,9 @@ def validate(config: ExperimentConfig) -> None:
     _one_of("agent.precision", agent.precision, PRECISIONS)
     _one_of("progress", config.progress, PROGRESS_MODES)
     _one_of("resume", config.resume, (EXACT, INEXACT))
-    _one_of("tracking.mode", config.tracking.mode, TRACKING_MODES)
     _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
     _check_transfer(config)
     _check_stop(config)
-    if config.tracking.mode == "self_hosted" and not config.tracking.base_url:
-        raise ConfigError("tracking=self_hosted needs the server's address: tracking.base_url=http://HOST:PORT")
 
 
 def _check_stop(config: ExperimentConfig) -> None:

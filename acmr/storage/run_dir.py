@@ -119,12 +119,16 @@ class RunDir:
 
     @contextmanager
     def log(self, say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
-        """Says lines to the user, and keeps each in ``run.log`` with its time, as long as the disk takes it."""
+        """Says lines to the user, and keeps each in ``run.log`` with its time.
+
+        A disk that does not take it, or a terminal that is gone, ends no run.
+        """
 
         def both(line: str) -> None:
             with suppress(OSError):
                 os.write(descriptor, f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n".encode())
-            say(line)
+            with suppress(OSError):
+                say(line)
 
         descriptor = self._open(self.log_file, os.O_WRONLY | os.O_APPEND)
         try:

@@ -1,4 +1,4 @@
-"""Mirrors of runs that exist already: shown in a terminal, sent to a server, written anew from a run's own files.
+"""What trackers show of runs that exist already: in a terminal, on a server, written anew from a run's own files.
 
 ``python -m acmr.tracking.mirror dashboard [FOLDER]``, ``... sync --base-url URL [FOLDER]``, ``... rebuild RUN_DIR...``.
 """
@@ -6,77 +6,53 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from heapq import merge
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from acmr.config import ConfigError, TrackingConfig
-from acmr.records import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, SUMMARY_FILE
-from acmr.text import one_line
+from acmr.config import ConfigError
+from acmr.records import CONFIG_FILE, SUMMARY_FILE
+from acmr.settings.compose import compose_config, options, parse, stored_config
+from acmr.settings.run_spec import RunSpec
+from acmr.text import message
+from acmr.tracking.observer import Say
 from acmr.tracking.wandb_backend import linked_mirrors, server_problem, wandb_environment
-from acmr.tracking.wandb_tracker import Tracker, labels, make_tracker
+from acmr.tracking.watchers import make_tracker, replay
 
-#: A row of a CSV file: its global step and its columns.
-Row = tuple[int, dict[str, float]]
-
-
-def replay(tracker: Tracker, run_dir: Path, until_step: int | None = None) -> None:
-    """Mirrors the rows that a run has written so far; a resumed run does this first.
-
-    Args:
-        tracker: A fresh tracker of the same run.
-        run_dir: The run's directory.
-        until_step: The last global step to mirror; None: all.
-    """
-    # An episode that ends at a step comes before that step's metrics, as in the run itself.
-    for step, row in merge(_rows(run_dir / EPISODES_FILE), _rows(run_dir / METRICS_FILE), key=lambda item: item[0]):
-        if until_step is not None and step > until_step:
-            break
-        tracker.metrics(step, row)
+_EXAMPLE = "runs/paper/armless_humanoid-hidden-frozen/seed_3"
 
 
-def rebuild(run_dir: Path, warn: Callable[[str], None]) -> None:
-    """Writes the offline mirror of a run anew from its own files, in place of the one that there may be.
+def rebuild(run_dir: Path, tracking: str, say: Say) -> None:
+    """Writes what a tracker shows of a run anew from the run's own files, in place of what there may be.
 
     Args:
         run_dir: The run's directory, finished or not: ``<output_dir>/<profile>/<run>/seed_<n>``.
-        warn: Called with one line if the mirror cannot be written.
+        tracking: Name of a file in ``conf/tracking``, whichever the run itself was made with.
+        say: Takes one line if it cannot be written.
 
     Raises:
         ConfigError: If this is no run's directory.
     """
     run_dir = run_dir.resolve()
     try:
-        settings: dict[str, Any] = yaml.safe_load((run_dir / CONFIG_FILE).read_text())
-        tracking = {**settings["tracking"], "mode": "offline", "base_url": None}
+        config = stored_config(yaml.safe_load((run_dir / CONFIG_FILE).read_text()))
         summary = _summary(run_dir)
-        run_name = run_dir.parent.name
-        words = labels(settings, run_name, summary.get("cell") if summary else None)
-        profile, seed = str(settings["profile"]), int(settings["seed"])
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
-        raise ConfigError(
-            f"{run_dir} is no run's directory ({one_line(error)}); give one as in {_example()}"
-        ) from error
-    tracker = make_tracker(
-        TrackingConfig(**tracking),
-        output_dir=run_dir.parents[2],
-        run_name=run_name,
-        profile=profile,
-        seed=seed,
-        settings=settings,
-        warn=warn,
-        **words,
-    )
+    except (OSError, yaml.YAMLError, ValueError) as error:
+        raise ConfigError(f"{run_dir} is no run's directory ({message(error)}); give one as in {_EXAMPLE}") from error
+    chosen = parse(compose_config([f"tracking={tracking}", "tracking.base_url=null"])).tracking
+    # The run's own project and folder, and its place as it is now: it may have been moved.
+    own = replace(config.tracking, tracker=chosen.tracker, options=chosen.options, base_url=None)
+    config = replace(config, tracking=own, output_dir=str(run_dir.parents[2]))
+    tracker = make_tracker(RunSpec(config, {}, run_dir.parent.name, summary.get("cell") if summary else None), say)
     replay(tracker, run_dir)
-    tracker.finish(summary, exit_code=0 if summary else 1)
+    tracker.close(summary)
 
 
 def unsent(folder: Path) -> list[Path]:
@@ -138,6 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m acmr.tracking.mirror", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     again = commands.add_parser("rebuild", help="write the mirrors of runs anew from their own files")
+    again.add_argument("--tracking", default="offline", choices=options("tracking"), help="default: offline (W&B)")
     again.add_argument("run_dirs", nargs="+", type=Path, metavar="RUN_DIR")
     send = commands.add_parser("sync", help="send offline mirrors to a server (key: WANDB_API_KEY)")
     send.add_argument("--base-url", default=os.environ.get("WANDB_BASE_URL") or None, help="as in http://HOST:PORT")
@@ -149,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if given.command == "rebuild":
             for run_dir in given.run_dirs:
-                rebuild(run_dir, problems.append)
+                rebuild(run_dir, given.tracking, problems.append)
         elif given.command == "dashboard":
             dashboard(given.folder)
         elif not given.base_url:
@@ -163,19 +140,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for problem in problems:
         print(f"error: {problem}", file=sys.stderr)
     return 2 if problems else 0
-
-
-def _rows(file: Path) -> Iterator[Row]:
-    """Rows of a CSV file whose every field is a number; a row that a kill tore is left out."""
-    if not file.exists():
-        return
-    with file.open(newline="") as lines:
-        reader = csv.reader(line for line in lines if line.endswith("\n"))
-        header = next(reader, [])
-        for fields in reader:
-            if len(fields) == len(header):
-                row = {key: float(text) for key, text in zip(header, fields, strict=True) if text}
-                yield int(row.pop("global_step")), row
 
 
 def _summary(run_dir: Path) -> dict[str, Any] | None:
@@ -193,10 +157,6 @@ def _log_folder(folder: Path) -> str:
     logs = folder.absolute() / ".home"
     logs.mkdir(exist_ok=True)
     return str(logs)
-
-
-def _example() -> str:
-    return "runs/paper/armless_humanoid-hidden-frozen/seed_3"
 
 
 if __name__ == "__main__":

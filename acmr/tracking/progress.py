@@ -6,85 +6,102 @@ import logging
 import os
 import sys
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TextIO
 
 from rich.console import Console
-from rich.live import Live
+from rich.progress import BarColumn, Progress, ProgressColumn, RenderableColumn
 from rich.text import Text
 
-from acmr.config import PROGRESS_MODES, ConfigError
+from acmr.config import THRESHOLD
 from acmr.records import EpisodeRecord
+from acmr.settings.run_spec import RunSpec
 from acmr.text import duration
+from acmr.tracking.observer import Observer, Say
 
 #: Seconds between two drawings of the bar, and between two lines.
 BAR_INTERVAL, LINE_INTERVAL = 0.5, 60.0
 #: The speed, and the time left that follows from it, is that of the last this many seconds: learning is slower than
 #: the random steps before it.
 SPEED_WINDOW = 20.0
-#: Columns that the bar itself may take; what it stands beside makes room for it, down to nothing.
+#: Columns that the bar itself may take; what it stands beside makes room for it.
 _SHORTEST_BAR, _LONGEST_BAR = 6, 40
+#: What stands in the line, from the widest terminal to the narrowest.
+_LAYOUTS = (
+    ("name", "bar", "share", "steps", "speed", "end", "standing"),
+    ("bar", "share", "steps", "speed", "end", "standing"),
+    ("bar", "share", "speed", "end", "standing"),
+    ("share", "steps", "end", "standing"),
+    ("share", "end", "standing"),
+    ("share", "standing"),
+    ("share",),
+)
 
 
-class RunProgress:
-    """Counts a run's steps and says now and then how it goes; this one says nothing.
+class RunProgress(Observer):
+    """Counts a run's steps, and shows now and then how it goes; this one shows nothing.
 
-    The clock is read at every ``_stride`` steps, and the stride follows the speed, so that a step costs almost nothing.
+    The clock is read at every so many steps only, and how many that are follows the speed: a step costs almost nothing.
+
+    Args:
+        spec: The run.
+        start_step: Steps that had been taken before.
+        clock: Tells the time in seconds.
+        console: Where rich is to draw; None: nowhere, and it measures the speed only.
     """
 
+    title = "progress"
     interval = float("inf")
 
     def __init__(
         self,
-        total_timesteps: int,
-        threshold: float,
-        consecutive: int,
+        spec: RunSpec,
         start_step: int = 0,
         clock: Callable[[], float] = time.monotonic,
-        stops: bool = False,
+        console: Console | None = None,
     ) -> None:
-        """Starts the clock; see :func:`make_progress`."""
-        self._total = total_timesteps
-        self._threshold = threshold
-        self._consecutive = consecutive
-        self._stops = stops
-        self._clock = clock
-        self._step = start_step
-        self._next_look = start_step + 1
-        self._started = self._shown_at = clock()
-        self._samples: deque[tuple[float, int]] = deque([(self._started, start_step)])
+        config = spec.config
+        self._name = " ".join([*([spec.cell] if spec.cell else []), spec.name, f"seed {config.seed}"])
+        self._total, self._threshold, self._consecutive = config.most_steps, config.threshold, config.consecutive
+        self._stops = config.stop == THRESHOLD
+        self._step, self._next_look = start_step, start_step + 1
+        self._clock, self._shown_at = clock, clock()
         self._latest: float | None = None
         self._streak = 0
         self._reached: int | None = None
+        self._progress = Progress(
+            console=console,
+            disable=console is None,
+            # No thread of rich's that would draw while the run computes.
+            auto_refresh=False,
+            speed_estimate_period=SPEED_WINDOW,
+            get_time=clock,
+        )
+        self._progress.add_task("", total=self._total, completed=start_step)
+        self._task = self._progress.tasks[0]
 
-    def update(self, global_step: int) -> None:
-        """Notes that ``global_step`` steps have been taken; to be called after each."""
-        self._step = global_step
-        if global_step >= self._next_look:
+    def on_step(self, step: int) -> None:
+        """Notes one more step."""
+        self._step = step
+        if step >= self._next_look:
             self._look()
 
-    def episode(self, record: EpisodeRecord) -> None:
+    def on_episode(self, record: EpisodeRecord) -> None:
         """Notes a finished episode."""
         self._latest = record.episodic_return
         self._streak = self._streak + 1 if record.episodic_return >= self._threshold else 0
         if self._streak >= self._consecutive and self._reached is None:
             self._reached = record.global_step
 
-    def close(self) -> None:
-        """Says how it stands at the end."""
-
     @property
     def steps_per_second(self) -> float:
         """Speed over the last :data:`SPEED_WINDOW` seconds; 0 before there is one."""
-        (since, first), (until, last) = self._samples[0], self._samples[-1]
-        return (last - first) / (until - since) if until > since else 0.0
+        return self._task.speed or 0.0
 
     @property
     def seconds_left(self) -> float | None:
-        """Time to the end at the present speed; None while that is unknown."""
-        speed = self.steps_per_second
-        return (self._total - self._step) / speed if speed > 0 else None
+        """Time to the last step at the present speed; None while that is unknown."""
+        return self._task.time_remaining
 
     @property
     def is_over(self) -> bool:
@@ -107,59 +124,59 @@ class RunProgress:
             return f"{latest}, {self._streak}/{self._consecutive} above {self._threshold:,g}"
         return f"{latest}, {self._threshold - self._latest:,.0f} below {self._threshold:,g}"
 
+    def took(self) -> str:
+        """How long this process has been at it."""
+        return duration(self._task.elapsed)
+
     def _look(self) -> None:
-        now = self._clock()
-        self._sample(now)
+        self._measure()
         # Short enough that a run which slows down twentyfold is not lost sight of.
         pause = min(self.interval / 10, 0.2)
         self._next_look = self._step + max(1, int(self.steps_per_second * pause))
+        now = self._clock()
         if now - self._shown_at >= self.interval:
             self._shown_at = now
             self._show()
 
-    def _sample(self, now: float) -> None:
-        while len(self._samples) > 1 and now - self._samples[1][0] >= SPEED_WINDOW:
-            self._samples.popleft()
-        if now > self._samples[-1][0]:
-            self._samples.append((now, self._step))
+    def _measure(self) -> None:
+        self._progress.update(self._task.id, completed=self._step)
 
     def _show(self) -> None:
         """Shows the state of things."""
 
 
 class LineProgress(RunProgress):
-    """A plain line now and then, and one at the end."""
+    """A plain line now and then, and one at the end.
+
+    Args:
+        spec: The run.
+        start_step: Steps that had been taken before.
+        clock: Tells the time in seconds.
+        say: Takes each line.
+    """
 
     interval = LINE_INTERVAL
 
     def __init__(
         self,
-        total_timesteps: int,
-        threshold: float,
-        consecutive: int,
-        title: str = "",
+        spec: RunSpec,
         start_step: int = 0,
-        say: Callable[[str], None] = lambda line: print(line, flush=True),
         clock: Callable[[], float] = time.monotonic,
-        stops: bool = False,
+        say: Say = lambda line: print(line, flush=True),
     ) -> None:
-        """Says where the run starts."""
-        super().__init__(total_timesteps, threshold, consecutive, start_step, clock, stops)
+        super().__init__(spec, start_step, clock)
         self._say = say
-        self._prefix = f"{title}: " if title else ""
-        ends = ", where it stops" if stops else ""
-        self._say(f"{self._prefix}step {start_step:,} of {total_timesteps:,}, threshold {threshold:,g}{ends}")
+        ends = ", where it stops" if self._stops else ""
+        self._say(f"{self._name}: step {start_step:,} of {self._total:,}, threshold {self._threshold:,g}{ends}")
 
-    def close(self) -> None:
+    def close(self, summary: object) -> None:
         """Says the last line."""
-        now = self._clock()
-        self._sample(now)
-        took = f"{duration(now - self._started)} in all"
-        self._say(f"{self._prefix}{self._counts()}, {took}, {self.standing()}")
+        self._measure()
+        self._say(f"{self._name}: {self._counts()}, {self.took()} in all, {self.standing()}")
 
     def _show(self) -> None:
         ahead = f", {self.time_left()} left" if self.seconds_left is not None else ""
-        self._say(f"{self._prefix}{self._counts()}{ahead}, {self.standing()}")
+        self._say(f"{self._name}: {self._counts()}{ahead}, {self.standing()}")
 
     def _counts(self) -> str:
         share = 100 * self._step / self._total
@@ -167,110 +184,70 @@ class LineProgress(RunProgress):
 
 
 class BarProgress(RunProgress):
-    """A bar at the bottom of the terminal; what is printed or logged meanwhile appears above it."""
+    """A bar at the bottom of the terminal; what is printed or logged meanwhile appears above it.
+
+    Args:
+        spec: The run.
+        start_step: Steps that had been taken before.
+        console: The terminal; None: standard output.
+    """
 
     interval = BAR_INTERVAL
 
-    def __init__(
-        self,
-        total_timesteps: int,
-        threshold: float,
-        consecutive: int,
-        title: str = "",
-        start_step: int = 0,
-        stops: bool = False,
-    ) -> None:
-        """Draws the bar on standard output."""
-        super().__init__(total_timesteps, threshold, consecutive, start_step, stops=stops)
-        self._title = title
-        # rich puts stand-ins in their place that write above the bar.
+    def __init__(self, spec: RunSpec, start_step: int = 0, console: Console | None = None) -> None:
+        super().__init__(spec, start_step, console=console or Console())
         terminals = {stream: name for name in ("stdout", "stderr") if (stream := getattr(sys, name)).isatty()}
-        self._live = Live(self._line(), console=Console(), auto_refresh=False)
-        self._live.start(refresh=True)
+        self._progress.start()
         # Left hidden, it would stay so after a kill.
-        self._live.console.show_cursor(True)
-        # Log handlers made before now hold the terminal itself and would write into the bar.
-        self._moved = [(handler, handler.stream) for handler in _stream_handlers() if handler.stream in terminals]
-        for handler, stream in self._moved:
-            handler.setStream(getattr(sys, terminals[stream]))
-
-    def close(self) -> None:
-        """Draws the bar a last time and leaves it on the screen."""
-        self._sample(self._clock())
+        self._progress.console.show_cursor(True)
         self._show()
-        self._live.stop()
+        # rich has put stand-ins in the place of both streams that write above the bar, but log handlers made before now
+        # hold the terminal itself.
+        self._moved: list[tuple[logging.StreamHandler[TextIO], TextIO]] = []
+        for handler in logging.root.handlers:
+            if isinstance(handler, logging.StreamHandler) and handler.stream in terminals:
+                self._moved.append((handler, handler.stream))
+                handler.setStream(getattr(sys, terminals[handler.stream]))
+
+    def close(self, summary: object) -> None:
+        """Draws the bar a last time and leaves it on the screen."""
+        self._measure()
+        self._show()
+        self._progress.stop()
         for handler, stream in self._moved:
             handler.setStream(stream)
-        self._moved = []
 
     def _show(self) -> None:
-        self._live.update(self._line(), refresh=True)
+        # Chosen anew each time: a terminal may be made wider or narrower.
+        self._progress.columns = self._columns(self._progress.console.width - 1)
+        self._progress.refresh()
 
-    def _line(self) -> Text:
-        return Text(self.line(Console().width - 1), no_wrap=True, overflow="ellipsis")
-
-    def line(self, width: int) -> str:
+    def _columns(self, width: int) -> tuple[ProgressColumn, ...]:
         """The bar, with as much beside it as ``width`` columns take."""
-        share = self._step / self._total
-        steps = f"{self._step:,}/{self._total:,}"
-        speed = f"{self.steps_per_second:,.0f} steps/s"
-        end = f"took {duration(self._clock() - self._started)}" if self.is_over else f"ETA {self.time_left()}"
-        percent = f"{100 * share:3.0f}%"
-        full = [percent, steps, speed, end, self.standing()]
-        for words in ([self._title, None, *full], [None, *full], [None, percent, speed, end, self.standing()]):
-            room = width - sum(len(word) + 1 for word in words if word)
-            if room >= _SHORTEST_BAR:
-                return " ".join(word or _bar(share, min(room, _LONGEST_BAR)) for word in words if word != "")
-        spare = [[percent, steps, end, self.standing()], [percent, end, self.standing()], [percent, self.standing()]]
-        return next((text for words in spare if len(text := " ".join(words)) <= width), percent)
+        words = {
+            "name": self._name,
+            "share": f"{100 * self._step / self._total:3.0f}%",
+            "steps": f"{self._step:,}/{self._total:,}",
+            "speed": f"{self.steps_per_second:,.0f} steps/s",
+            "end": f"took {self.took()}" if self.is_over else f"ETA {self.time_left()}",
+            "standing": self.standing(),
+        }
+        for layout in _LAYOUTS:
+            room = width - sum(len(words[part]) + 1 for part in layout if part != "bar")
+            if room >= (_SHORTEST_BAR if "bar" in layout else -1):
+                break
+        bar = BarColumn(bar_width=min(room, _LONGEST_BAR))
+        return tuple(bar if part == "bar" else RenderableColumn(Text(words[part])) for part in layout)
 
 
-def make_progress(
-    mode: str,
-    *,
-    total_timesteps: int,
-    threshold: float,
-    consecutive: int = 5,
-    title: str = "",
-    start_step: int = 0,
-    stops: bool = False,
-    say: Callable[[str], None] = lambda line: print(line, flush=True),
-) -> RunProgress:
-    """Shows how far a run is.
+def make_progress(spec: RunSpec, start_step: int = 0) -> Observer:
+    """Shows how far a run is, as its setting ``progress`` says.
 
-    Args:
-        mode: ``bar``, ``lines``, ``off``, or ``auto``: a bar where standard output is a terminal, else lines.
-        total_timesteps: Steps that the run takes at most.
-        threshold: Return to reach.
-        consecutive: Episodes running that must reach it.
-        title: Name of the run.
-        start_step: Steps that had been taken before.
-        stops: Whether the run ends once it has reached its threshold.
-        say: Takes a line, in the mode ``lines``.
-
-    Raises:
-        ConfigError: If there is no such mode.
+    ``bar``, ``lines``, ``off``, or ``auto``: a bar where standard output is a terminal, else lines.
     """
-    if mode not in PROGRESS_MODES:
-        raise ConfigError(f"progress={mode}: must be one of {', '.join(PROGRESS_MODES)}")
+    mode = spec.config.progress
     if mode == "auto":
         mode = "bar" if sys.stdout.isatty() and os.environ.get("TERM") not in (None, "", "dumb") else "lines"
     if mode == "bar":
-        return BarProgress(total_timesteps, threshold, consecutive, title, start_step, stops)
-    if mode == "lines":
-        return LineProgress(total_timesteps, threshold, consecutive, title, start_step, say, stops=stops)
-    return RunProgress(total_timesteps, threshold, consecutive, start_step, stops=stops)
-
-
-def _bar(share: float, width: int) -> str:
-    done = min(width, int(share * width))
-    return "\u2501" * done + "\u2500" * (width - done)
-
-
-def _stream_handlers() -> Iterator[logging.StreamHandler[TextIO]]:
-    """Every log handler that writes to a stream, files apart."""
-    named = [logger for logger in logging.root.manager.loggerDict.values() if isinstance(logger, logging.Logger)]
-    for logger in (logging.root, *named):
-        for handler in logger.handlers:
-            if isinstance(handler, logging.StreamHandler) and not isinstance(handler, logging.FileHandler):
-                yield handler
+        return BarProgress(spec, start_step)
+    return LineProgress(spec, start_step) if mode == "lines" else Observer()

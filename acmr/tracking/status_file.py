@@ -8,50 +8,57 @@ from __future__ import annotations
 import os
 import platform
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from acmr.records import RUNNING, STATUS_FILE
+from acmr.records import RUNNING, STATUS_FILE, STOPPED, EpisodeRecord
 from acmr.storage.json_files import read_json, replace_json
+from acmr.tracking.observer import Observer
+
+if TYPE_CHECKING:
+    # Whoever only reads the file need not load Hydra.
+    from acmr.settings.run_spec import RunSpec
 
 #: Seconds between two writings, and steps between two looks at the clock.
 INTERVAL, STRIDE = 2.0, 16
 
 
-class Heartbeat:
+class StatusFile(Observer):
     """Keeps ``status.json`` of a run up to date.
 
     Args:
-        folder: The run's directory.
-        total_timesteps: Steps that the run takes at most.
+        spec: The run.
         start_step: Steps that had been taken before.
     """
 
-    def __init__(self, folder: Path, total_timesteps: int, start_step: int = 0) -> None:
-        self._path = folder / STATUS_FILE
-        self._total, self._step = total_timesteps, start_step
+    title = "status file"
+
+    def __init__(self, spec: RunSpec, start_step: int = 0) -> None:
+        self._path = spec.directory / STATUS_FILE
+        self._total, self._step = spec.config.most_steps, start_step
         self._latest: float | None = None
         self._started = time.time()
         self._since = (time.monotonic(), start_step)
         self._write(RUNNING, 0.0)
 
-    def step(self, global_step: int) -> None:
+    def on_step(self, step: int) -> None:
         """Notes one more step."""
-        self._step = global_step
-        if global_step % STRIDE == 0:
+        self._step = step
+        if step % STRIDE == 0:
             now, (before, first) = time.monotonic(), self._since
             if now - before >= INTERVAL:
-                self._since = (now, global_step)
-                self._write(RUNNING, (global_step - first) / (now - before))
+                self._since = (now, step)
+                self._write(RUNNING, (step - first) / (now - before))
 
-    def episode(self, episodic_return: float) -> None:
+    def on_episode(self, record: EpisodeRecord) -> None:
         """Notes the return of the latest episode."""
-        self._latest = episodic_return
+        self._latest = record.episodic_return
 
-    def close(self, state: str) -> None:
+    def close(self, summary: Mapping[str, Any] | None) -> None:
         """Says how it ended."""
-        self._write(state, 0.0)
+        self._write(STOPPED if summary is None else str(summary["status"]), 0.0)
 
     def _write(self, state: str, steps_per_second: float) -> None:
         content = {

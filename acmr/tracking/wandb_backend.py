@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from acmr.config import TrackingConfig
+from acmr.settings.run_spec import RunSpec
 from acmr.text import one_line
 
 if TYPE_CHECKING:
@@ -40,26 +40,27 @@ _TIMED = re.compile(r"(offline-)?run-(\d{8}_\d{6})-")
 _NOT_IN_ID = re.compile(r"[^A-Za-z0-9_.,=+-]+")
 
 
-def mirror_folder(config: TrackingConfig, output_dir: Path) -> Path:
+def mirror_folder(spec: RunSpec) -> Path:
     """The one flat folder of all mirrors, absolute; W&B insists on the name ``wandb``."""
-    if config.dir is None:
-        return output_dir.absolute() / "wandb"
-    folder = Path(config.dir).expanduser().absolute()
+    chosen = spec.config.tracking.dir
+    if chosen is None:
+        return Path(spec.config.output_dir).absolute() / "wandb"
+    folder = Path(chosen).expanduser().absolute()
     return folder if folder.name == "wandb" else folder / "wandb"
 
 
-def run_id(config: TrackingConfig, output_dir: Path, profile: str, run_name: str, seed: int) -> str:
+def run_id(spec: RunSpec) -> str:
     """A readable id, the same whenever the same run is started: ``paper-armless_humanoid-hidden-frozen-s3``.
 
     A folder that was chosen may serve several output directories: there the id tells them apart.
     """
-    name = f"{profile}-{run_name}"
-    ending = f"-s{seed}"
-    if config.dir is not None:
-        ending += "-" + hashlib.sha256(str(output_dir.absolute()).encode()).hexdigest()[:6]
+    name = f"{spec.config.profile}-{spec.name}"
+    ending = f"-s{spec.config.seed}"
+    if spec.config.tracking.dir is not None:
+        ending += "-" + _digest(str(Path(spec.config.output_dir).absolute()))
     clean = _NOT_IN_ID.sub("_", name)
     if clean != name or len(clean) + len(ending) > LONGEST["id"]:
-        ending = "-" + hashlib.sha256(name.encode()).hexdigest()[:6] + ending
+        ending = f"-{_digest(name)}{ending}"
     return clean[: LONGEST["id"] - len(ending)] + ending
 
 
@@ -139,7 +140,19 @@ def _ask(base_url: str) -> str:
 
 
 def start(arguments: Mapping[str, Any], folder: Path, server: str | None) -> Run:
-    """Starts W&B; raises whatever W&B raises."""
+    """Starts W&B; raises whatever W&B raises, and leaves no service process then."""
+    try:
+        return _start(arguments, folder, server)
+    except SystemExit as error:
+        # W&B would end the whole process.
+        end_service(1)
+        raise RuntimeError(f"W&B ended with exit code {error.code}") from error
+    except Exception:
+        end_service(1)
+        raise
+
+
+def _start(arguments: Mapping[str, Any], folder: Path, server: str | None) -> Run:
     with wandb_variables(wandb_environment(folder)):
         import wandb
 
@@ -234,3 +247,7 @@ def _id_of(mirror: Path) -> str:
 
 def _holds(path: Path, name: str) -> bool:
     return (path / f"run-{name}.wandb").exists() or not any(path.glob("run-*.wandb"))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:6]
