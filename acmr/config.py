@@ -127,7 +127,7 @@ class TrackingConfig:
     tracker: str | None = "acmr.tracking.wandb_tracker.WandbTracker"
     project: str = "acmr"
     entity: str | None = None
-    #: Address of a W&B server; None: offline.
+    #: Address of a W&B server; None: offline; empty: it has to be given.
     base_url: str | None = None
     #: Folder of the offline runs; None: ``<output_dir>/wandb``.
     dir: str | None = None

@@ -27,8 +27,6 @@ from acmr.config import ConfigError, EnvConfig, ExperimentConfig, flatten, schem
 from acmr.settings.validate import validate
 
 CONFIG_FOLDER = Path(__file__).resolve().parents[2] / "conf"
-#: What to type for settings that some files of ``conf/`` leave open (``???``).
-_EXAMPLES = {"env.id": "Hopper-v5", "tracking.base_url": "http://HOST:PORT"}
 
 
 def register_schema() -> None:
@@ -49,7 +47,7 @@ def parse(cfg: DictConfig) -> ExperimentConfig:
         # The one knows its own place; the other says the place that it leads to.
         own = isinstance(error, MissingMandatoryValue) and error.full_key
         key = own or str(error).strip().splitlines()[0].rpartition(": ")[2]
-        example = f" (for example {key}={_EXAMPLES[key]})" if key in _EXAMPLES else ""
+        example = " (for example env.id=Hopper-v5)" if key == "env.id" else ""
         raise ConfigError(f"{key} has no value: type {key}=VALUE{example}") from error
     assert isinstance(config, ExperimentConfig)
     validate(config)

@@ -52,6 +52,8 @@ def validate(config: ExperimentConfig) -> None:
     _one_of("progress", config.progress, PROGRESS_MODES)
     _one_of("resume", config.resume, (EXACT, INEXACT))
     _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
+    if config.tracking.base_url == "":
+        raise ConfigError("tracking=self_hosted needs the server's address: type tracking.base_url=http://HOST:PORT")
     _check_transfer(config)
     _check_stop(config)
 
