@@ -35,18 +35,32 @@ def copy_checkout(folder: Path) -> Path:
 
 
 def follow(guide: Path, folder: Path) -> str:
-    """Writes the files of a guide into a folder and runs its bash blocks there in order; returns what they say."""
-    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
-    said = ""
-    for block in blocks(guide):
-        if block.file is not None:
-            (folder / block.file).parent.mkdir(parents=True, exist_ok=True)
-            (folder / block.file).write_text(block.text)
-        elif block.language == "bash":
-            done = subprocess.run(
-                ["bash", "-euo", "pipefail", "-c", block.text], cwd=folder, env=environment, text=True,
-                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=240,
-            )  # fmt: skip
-            said += done.stdout
-            assert done.returncode == 0, f"{guide.name}: {block.text}\n{done.stdout}"
-    return said
+    """Does in a folder what a guide says, block by block in order; returns what its commands say."""
+    return "".join(do(block, folder) for block in blocks(guide))
+
+
+def do(block: Block, folder: Path) -> str:
+    """Writes the file of a block, makes its change to a file (diff), or runs it (bash); returns what it says."""
+    if block.file is not None:
+        path = folder / block.file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(patched(path.read_text(), block.text) if block.language == "diff" else block.text)
+    elif block.language == "bash":
+        environment = {
+            **os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "OMP_NUM_THREADS": "1",
+        }  # fmt: skip
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", block.text], cwd=folder, env=environment, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=240,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{block.text}\n{done.stdout}"
+        return done.stdout
+    return ""
+
+
+def patched(text: str, diff: str) -> str:
+    """A text after a change that is written as lines with a blank, minus or plus before them, without line numbers."""
+    lines = [(line[:1], f"{line[1:]}\n") for line in diff.splitlines()]
+    before, after = ("".join(line for sign, line in lines if sign != other) for other in "+-")
+    assert text.count(before) == 1, f"not once in the file:\n{before}"
+    return text.replace(before, after)
