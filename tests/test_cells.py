@@ -14,6 +14,7 @@ from matplotlib.colors import is_color_like
 from matplotlib.markers import MarkerStyle
 from statsmodels.stats.multitest import multipletests
 
+from acmr import cells
 from acmr.cells import CELLS, SOURCE, TARGET, Cell, cell_of, planned_cells, run_name
 from acmr.settings.compose import compose_config, parse
 from acmr.settings.run_spec import RunSpec, specify
@@ -23,6 +24,7 @@ from analysis.loading.load import load
 from analysis.loading.missing import matrix_command, missing_runs
 from analysis.loading.setting_differences import setting_differences
 from analysis.report.prose import about_n, caveats
+from analysis.report.stamp import fingerprint
 from analysis.statistics.summaries import table1, table2, transfer_table
 
 PAPER = [cell.name for cell in CELLS.values() if cell.published]
@@ -224,3 +226,15 @@ def test_a_foreign_directory_may_have_any_cells_name(mine, tmp_path):
     (folder / "episodes.csv").write_text(csv_text(rows_reaching(6000, TOTAL), columns=3))
     assert only(tmp_path)["cell"] == "B1"
     assert run_directory(tmp_path, "B1", 1, "quick") == folder
+
+
+def test_results_are_made_again_for_another_row(monkeypatch, tmp_path):
+    rows = tmp_path / "ground" / "cells.py"
+    rows.parent.mkdir()
+    rows.write_text(Path(cells.__file__).read_text())
+    monkeypatch.setattr(cells, "__file__", str(rows))
+    data = load(tmp_path)
+    before = fingerprint(data, tmp_path, {})
+    assert fingerprint(data, tmp_path, {}) == before
+    rows.write_text(rows.read_text().replace('"Conf. 4"', '"Conf. 5"'))
+    assert fingerprint(data, tmp_path, {}) != before

@@ -6,6 +6,7 @@ import hashlib
 import os
 from pathlib import Path
 
+from acmr import cells
 from acmr.records import STATUS_FILE
 from analysis.loading.load import RunSet
 from analysis.report.html import RUN_FILES
@@ -15,7 +16,7 @@ STAMP = "inputs.sha256"
 
 
 def fingerprint(data: RunSet, out: Path, settings: dict[str, object]) -> str:
-    """Hash of all that the results follow from: contents of the runs, the analysis itself, its settings.
+    """Hash of all that the results follow from: contents of the runs, the analysis, the cells, the settings.
 
     Args:
         data: The runs.
@@ -24,10 +25,11 @@ def fingerprint(data: RunSet, out: Path, settings: dict[str, object]) -> str:
     """
     digest = hashlib.sha256(repr(sorted(settings.items())).encode())
     digest.update(os.path.relpath(data.root.resolve(), out.resolve()).encode())
-    package = Path(__file__).parent.parent
+    package, ground = Path(__file__).parent.parent, Path(cells.__file__).parent
     sources = sorted(path for path in package.rglob("*") if path.suffix in (".py", ".html", ".css", ".js", ".csv"))
     runs = [data.root / str(run) / name for run in data.runs.index for name in (*RUN_FILES, STATUS_FILE)]
-    for path, base in [*((path, package) for path in sources), *((path, data.root) for path in runs)]:
+    places = {package: sources, ground: sorted(ground.glob("*.py")), data.root: runs}
+    for base, path in [(base, path) for base, paths in places.items() for path in paths]:
         if path.is_file():
             content = hashlib.sha256(path.read_bytes()).hexdigest()
             digest.update(f"{path.relative_to(base).as_posix()} {content}\n".encode())
