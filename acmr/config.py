@@ -42,13 +42,19 @@ class ConfigError(ValueError):
 class EnvConfig:
     """An environment: a Gymnasium id and how the robot's body differs from it."""
 
+    #: Its file in ``conf/env``; part of the name of every run in it.
     name: str = "???"
+    #: The Gymnasium id with its version; ``module:Name-v0`` imports the module that registers it.
     id: str = "???"
     #: Name of the environment whose agent teaches in this one (its own name: same body).
     source: str = "???"
+    #: Arguments of the environment, as in ``gymnasium.make(id, **kwargs)``.
     kwargs: dict[str, Any] = field(default_factory=dict)
+    #: Names of MuJoCo bodies that the robot lacks, with all that hangs on them.
     remove_bodies: list[str] = field(default_factory=list)
+    #: Observations that the agent does not see: names, globs such as ``cinert/*``, or indices.
     drop_sensors: list[int | str] = field(default_factory=list)
+    #: Actions that the agent does not command, given in the same way; the robot stays whole.
     drop_actuators: list[int | str] = field(default_factory=list)
     #: Steps an episode may take; None: as registered with Gymnasium.
     max_episode_steps: int | None = None
@@ -58,17 +64,29 @@ class EnvConfig:
 class SACConfig:
     """Soft Actor-Critic, with the paper's values (docs/paper.md)."""
 
+    #: Width of each hidden layer, in the actor as in the critics.
     hidden_sizes: list[int] = field(default_factory=lambda: [256, 256])
+    #: Discount of future rewards, per step.
     gamma: float = 0.99
+    #: Share of the critics that their targets take over in one update (Polyak).
     tau: float = 0.005
+    #: Transitions in one update.
     batch_size: int = 256
+    #: Transitions that the replay buffer holds; the oldest go first.
     buffer_size: int = 1_000_000
+    #: Steps with uniformly random actions before the first update.
     learning_starts: int = 5_000
+    #: Learning rate of the actor (Adam).
     policy_lr: float = 3e-4
+    #: Learning rate of the critics and of the temperature (Adam).
     q_lr: float = 1e-3
+    #: Steps between two updates of the actor, which then makes up for the delay with so many at once.
     policy_frequency: int = 2
+    #: Steps between two updates of the target critics.
     target_network_frequency: int = 1
+    #: Whether the temperature is learned, so that the entropy stays at minus the number of actions.
     autotune: bool = True
+    #: The temperature where it is not learned.
     alpha: float = 0.2
     #: Of matrix products: float32 or bfloat16. Weights and optimizers are in float32 either way.
     precision: str = PRECISIONS[0]
@@ -139,7 +157,9 @@ class TrackingConfig:
 class PairConfig:
     """The two environments that a profile's cells are made of."""
 
+    #: Name of the environment that teachers learn in.
     source: str = "humanoid"
+    #: Name of the environment that students learn in.
     target: str = "armless_humanoid"
 
 
@@ -147,20 +167,30 @@ class PairConfig:
 class ExperimentConfig:
     """Everything that defines one run."""
 
+    #: Of every random number of the run. A teacher that no path names is the one with the same seed.
     seed: int = 1
+    #: Whether what is copied from the teacher stays as it is.
     freeze: bool = False
+    #: Environment steps that the run takes.
     total_timesteps: int = 1_000_000
+    #: Raw episodic return that counts as success.
     threshold: float = 4900.0
+    #: Episodes in a row that have to reach the threshold.
     consecutive: int = 5
     #: ``horizon``: all steps are taken; ``threshold``: the run ends with the episode that completes the streak of
     #: ``consecutive`` ones at the threshold. Until there it is bit for bit the run that takes all steps.
     stop: str = HORIZON
     #: Steps after which a run with ``stop=threshold`` ends even if it has not met it; None: ``total_timesteps``.
     stop_after: int | None = None
+    #: Where networks and replay buffer are: ``cpu`` or ``cuda``.
     device: str = "cpu"
+    #: Threads that PyTorch computes with on the CPU.
     threads: int = 1
+    #: Folder of all runs; a run's own directory in it follows from its settings.
     output_dir: str = "runs"
+    #: Whether to train anew what is finished or under way there.
     force: bool = False
+    #: What is shown while it trains: ``bar``, ``lines``, ``off``; ``auto``: a bar in a terminal, else lines.
     progress: str = "auto"
     #: Environment steps between two rows of metrics.
     log_every: int = 1_000
@@ -168,6 +198,7 @@ class ExperimentConfig:
     checkpoint_every: int | None = None
     #: ``inexact`` goes on from a checkpoint of another machine or of other versions, and records that.
     resume: str = EXACT
+    #: Name of the file in ``conf/profile`` whose values hold where nothing else is said.
     profile: str = "paper"
     pair: PairConfig = field(default_factory=PairConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
