@@ -1,4 +1,4 @@
-"""Edits a robot by name: the same environment, with parts of the body missing."""
+"""Removes bodies from MuJoCo robots by name, with everything that hangs on them or names a part of them."""
 
 from __future__ import annotations
 

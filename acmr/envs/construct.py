@@ -1,4 +1,4 @@
-"""From settings to a running Gymnasium environment, or to one line that says why not."""
+"""Constructs a Gymnasium environment from its settings; what cannot be constructed is refused in one line."""
 
 from __future__ import annotations
 
@@ -77,6 +77,7 @@ def construct(config: EnvConfig, render_mode: str | None = None) -> gym.Env[Any,
         if render_mode not in modes:
             raise ConfigError(f"render_mode={render_mode}: {config.id} offers {', '.join(modes) or 'none'}")
         kwargs["render_mode"] = render_mode
+    # Gymnasium would check at every step that there was a reset, and what is passed; the trainer sees to both.
     spec.order_enforce = False
     with _quiet_models():
         try:

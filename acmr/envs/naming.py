@@ -1,4 +1,4 @@
-"""A name for every observation and every action of an environment.
+"""Names every observation and every action of an environment.
 
 A name is only given where it is proved: the environment is stepped, and each observation is compared with the MuJoCo
 field that it is named after. What does not agree is named by its index.

@@ -1,4 +1,4 @@
-"""Sensors and actuators that fail while the body stays."""
+"""Takes sensors and actuators from an agent while the robot's body stays whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draws an environment as it is, without a screen.
+"""Renders an environment without a screen.
 
 MuJoCo robots are drawn by a camera of our own that follows them; other environments draw themselves. The OpenGL
 library is loaded when the first camera is made, so that nothing else depends on there being one.

@@ -95,9 +95,9 @@ def evaluate(given: argparse.Namespace) -> None:
         print(f"warning: {remark}", file=sys.stderr)
     actor = teacher.build_networks().actor.eval()
     episodes = []
-    shot = VideoOptions(given.video, given.seconds, given.width, given.height) if given.video else None
+    video = VideoOptions(given.video, given.seconds, given.width, given.height) if given.video else None
     for episode in play(
-        actor, config, episodes=given.episodes, seed=given.seed, stochastic=given.stochastic, shot=shot
+        actor, config, episodes=given.episodes, seed=given.seed, stochastic=given.stochastic, video=video
     ):
         episodes.append(episode)
         end = "terminated" if episode.terminated else "time limit"

@@ -1,4 +1,4 @@
-"""Lets a policy act in its environment, and films it if asked to."""
+"""Plays episodes with a policy, and films them if asked to."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class VideoOptions:
 
 
 def play(
-    actor: Actor, config: EnvConfig, *, episodes: int, seed: int, stochastic: bool, shot: VideoOptions | None = None
+    actor: Actor, config: EnvConfig, *, episodes: int, seed: int, stochastic: bool, video: VideoOptions | None = None
 ) -> Iterator[Episode]:
     """Plays episodes, each the same whatever came before it.
 
@@ -62,7 +62,7 @@ def play(
         episodes: How many to play.
         seed: The k-th episode (k = 0, 1, ...) is reset with ``seed + k``.
         stochastic: Sample actions, as in training; else take the mean action.
-        shot: What to film.
+        video: What to film.
 
     Raises:
         ConfigError: If the environment cannot be made.
@@ -71,8 +71,8 @@ def play(
     from acmr.envs import describe, make_env
 
     about = describe(config)
-    env = make_env(config, render_mode=None if shot is None else render_mode(config))
-    film = Film(shot.path, env, shot.width, shot.height, shot.seconds) if shot is not None else None
+    env = make_env(config, render_mode=None if video is None else render_mode(config))
+    film = Film(video.path, env, video.width, video.height, video.seconds) if video is not None else None
     try:
         for number in range(episodes):
             noise = torch.Generator().manual_seed(seed + number)

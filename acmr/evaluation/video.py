@@ -1,4 +1,4 @@
-"""Films an environment, at its own speed."""
+"""Films an environment as mp4 or GIF, at its own speed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ENVIRONMENTS_OWN_FPS = 30.0
 
 
 class Film:
-    """An mp4 or gif file at the environment's own speed; one that cannot be made costs a line, and no more.
+    """An mp4 or gif file at the environment's own speed; if it cannot be made, one line says why.
 
     Attributes:
         fps: Frames per second.
@@ -61,13 +61,13 @@ class Film:
         self._steps = self._frames = 0
         self._writer: Any = None
         self._camera: Camera | None = None
-        with self._costing_a_line():
+        with self._reporting_errors():
             self._camera = make_camera(env, width, height)
 
     def step(self) -> None:
         """Takes the environment's present state in; to be called before every step."""
         if self._camera is not None and self._steps % self._stride == 0:
-            with self._costing_a_line():
+            with self._reporting_errors():
                 self._write(self._camera.frame())
             if self._frames >= self._planned:
                 self.close()
@@ -81,7 +81,7 @@ class Film:
     def close(self) -> None:
         """Ends the file, if that has not been done, and says where it is."""
         filmed = self._camera is not None and self._writer is not None
-        with self._costing_a_line():
+        with self._reporting_errors():
             self._end()
             if filmed:
                 length = f"{self._frames / self.fps:.1f} s"
@@ -90,7 +90,7 @@ class Film:
                 self._say(f"video: {self._path}, {self._frames} frames at {self.fps:.1f} a second, {length}")
 
     @contextmanager
-    def _costing_a_line(self) -> Iterator[None]:
+    def _reporting_errors(self) -> Iterator[None]:
         try:
             yield
         except (ConfigError, OSError) as error:

@@ -1,4 +1,4 @@
-"""Which run the settings mean: its name, its directory, its cell, its teacher, its command line."""
+"""Derives from the settings which run they mean: its name, directory, cell, teacher and command line."""
 
 from __future__ import annotations
 
