@@ -143,7 +143,9 @@ class TrackingConfig:
 
     #: The class that is told how the run goes (docs/howto-tracking.md); None: none.
     tracker: str | None = "acmr.tracking.wandb_tracker.WandbTracker"
+    #: Project on W&B that holds the run.
     project: str = "acmr"
+    #: Team or user on W&B; None: whose key it is.
     entity: str | None = None
     #: Address of a W&B server; None: offline; empty: it has to be given.
     base_url: str | None = None

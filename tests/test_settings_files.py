@@ -1,6 +1,7 @@
 """The files of conf/: one that builds on another, ones that are wrong, those of the guide."""
 
 import shutil
+from dataclasses import fields
 from pathlib import Path
 
 import hydra
@@ -8,6 +9,15 @@ import pytest
 from guides import ROOT, blocks
 from omegaconf import OmegaConf
 
+from acmr.config import (
+    EnvConfig,
+    ExperimentConfig,
+    PairConfig,
+    SACConfig,
+    TrackingConfig,
+    TransferConfig,
+    TransferRules,
+)
 from acmr.envs import describe
 from acmr.settings import compose
 from acmr.settings.compose import compose_config, environment_config, options
@@ -93,3 +103,18 @@ def test_files_that_are_read_once_make_what_hydra_makes_of_them() -> None:
             theirs = hydra.compose("config", overrides=overrides)
         ours = [OmegaConf.to_container(compose_config(overrides)) for _ in range(2)]
         assert ours == [OmegaConf.to_container(theirs)] * 2
+
+
+def test_every_setting_says_in_a_comment_what_it_means() -> None:
+    lines = (ROOT / "acmr" / "config.py").read_text().splitlines()
+    silent, seen = [], set()
+    for kind in (EnvConfig, SACConfig, TransferConfig, TransferRules, TrackingConfig, PairConfig, ExperimentConfig):
+        start = lines.index(f"class {kind.__name__}:")
+        for entry in fields(kind):
+            row = next(row for row in range(start, len(lines)) if lines[row].startswith(f"    {entry.name}: "))
+            seen.add(row)
+            # A group of settings is described by its class.
+            if not str(entry.type).endswith(("Config", "Rules")) and not lines[row - 1].startswith("    #: "):
+                silent.append(f"{kind.__name__}.{entry.name}")
+    assert silent == []
+    assert len(seen) > 50
