@@ -25,6 +25,8 @@ STATUS_FILE, LOG_FILE = "status.json", "run.log"
 TENSOR_FILE, DESCRIPTION_FILE = "teacher.safetensors", "teacher.json"
 #: What ``python -m acmr.evaluation`` adds afterwards.
 EVALUATION_FILE = "evaluation.json"
+#: Folder of TensorBoard's event files: they show a run, and are no result.
+EVENTS_FOLDER = "tensorboard"
 #: A run's place below the folder of all runs, as a pattern: ``<profile>/<name>/seed_<n>``.
 RUN_PATTERN = "*/*/seed_*"
 SEED_FOLDER = re.compile(r"seed_(\d+)")

@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import re
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -22,6 +23,7 @@ from acmr.records import (
     DESCRIPTION_FILE,
     EPISODES_FILE,
     EVALUATION_FILE,
+    EVENTS_FOLDER,
     LOG_FILE,
     METRICS_FILE,
     SUMMARY_FILE,
@@ -95,6 +97,8 @@ class RunDir:
         """Clears what an unfinished or repeated run left, and stores the settings."""
         for name in _RESULTS:
             remove(self.path / name)
+        # Whether or not this run is shown there, the old one must not be.
+        shutil.rmtree(self.path / EVENTS_FOLDER, ignore_errors=True)
         # Nothing of the old run may come back once the new one has begun.
         sync_folder(self.path)
         write_bytes(self.config_file, yaml.safe_dump(dict(settings), sort_keys=False).encode())
