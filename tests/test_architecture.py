@@ -1,4 +1,4 @@
-"""The import rule, read from docs/architecture.md, which prints it; and the size of files, packages and importers."""
+"""The import rule that docs/architecture.md prints; sizes of files, packages and importers; the map of the rooms."""
 
 import ast
 import re
@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from acmr import records
+from docs.rooms import PACKAGES, PICTURE, ROOT, draw, imports, module_of, modules, read_rule
 
-ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("acmr", "analysis", "sweeps")
+PAGE = ROOT / "docs" / "architecture.md"
 #: Modules of one package; a longer list is no map.
 MOST_MODULES = 10
 #: Modules of ours that one of the analysis may import; what knows more than that should be told the rest.
@@ -21,36 +21,11 @@ HYDRA_BORDER = ("acmr/settings", "sweeps")
 HEAVY = {"torch", "wandb", "hydra", "omegaconf", "mujoco", "gymnasium"}
 
 
-def read_rule(package: str) -> list[list[set[str]]]:
-    """Levels of a package, lowest first; a level has groups of parts, and a group may not import another one."""
-    page = (ROOT / "docs" / "architecture.md").read_text()
-    line = re.search(rf"^{package}: +(.+)$", page, re.MULTILINE)
-    assert line, f"docs/architecture.md has no import rule of {package}"
-    return [[set(group.split(", ")) for group in level.split(" | ")] for level in line[1].split(" <- ")]
-
-
 def sources(*packages: str) -> list[Path]:
     return [path for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
 
 
-def module_of(path: Path) -> str:
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-MODULES = {module_of(path): path for path in sources(*PACKAGES)}
-
-
-def imports(path: Path) -> set[str]:
-    """Every module that a file imports, wherever in it; what is imported from a package counts as the module it is."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            inner = {f"{node.module}.{alias.name}" for alias in node.names} & MODULES.keys()
-            found |= inner or {node.module}
-    return found
+MODULES = modules()
 
 
 def literals(path: Path) -> set[str]:
@@ -143,3 +118,17 @@ def test_no_module_imports_too_many(path):
 @pytest.mark.parametrize("path", sources(*PACKAGES, "tests", "bench"), ids=names)
 def test_no_file_is_longer_than_300_lines(path):
     assert len(path.read_text().splitlines()) <= 300
+
+
+@pytest.mark.parametrize(
+    ("heading", "most"), [("From the command line to the networks", 8), ("From env.step to Table 3", 10)]
+)
+def test_the_ways_through_the_code_are_short_and_there(heading, most):
+    section = PAGE.read_text().split(f"## {heading}\n")[1].split("\n## ")[0]
+    files = re.findall(r"^\d+\. `([^`]+)`", section, re.MULTILINE)
+    assert 0 < len(files) <= most
+    assert [file for file in files if not (ROOT / file).is_file()] == []
+
+
+def test_the_picture_of_the_rooms_is_of_this_code():
+    assert PICTURE.read_text() == draw(), "python -m docs.rooms draws it"
