@@ -1,1 +1,1 @@
-"""Many runs: what has to be trained, in which order, by which processes, and how far it is."""
+"""Sweeps: plans many runs, trains them by several workers, shows how far they are."""

@@ -1,4 +1,4 @@
-"""What the user sees of a sweep: a live table in a terminal, plain lines elsewhere, and at the end what failed."""
+"""The output of a sweep: its plan, a live table in a terminal, plain lines elsewhere, and at the end what failed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Display:
         self._told: dict[int, tuple[str, str]] = {}
         self._started = time.monotonic()
         self._said_at = self._looked_at = self._started
-        # Looking at many runs takes time from the trainings.
+        # Reading the files of many runs takes time from the trainings.
         self._interval = 1.0 if len(entries) <= 100 else 5.0
         self._console = make_console()
         terminal = sys.stdout.isatty() and os.environ.get("TERM") not in (None, "", "dumb")

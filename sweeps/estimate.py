@@ -1,4 +1,4 @@
-"""What a sweep will need: time, disk and memory; measured where there are such runs, else worked out or left open."""
+"""Estimates the time, disk and memory of a sweep: from finished runs where there are some, else computed or unknown."""
 
 from __future__ import annotations
 
@@ -123,6 +123,7 @@ def _makespan(plan: Plan, seconds: dict[int, float], workers: int) -> float:
         if not ready:
             free[free.index(now)] = min(end for end in [*free, *ends.values()] if end > now)
             continue
+        # The order is that in which workers take up runs; see Worker.take_next.
         waiting.remove(ready[0])
         free[free.index(now)] = ends[ready[0]] = now + seconds[ready[0]]
     return max(ends.values(), default=0.0)

@@ -1,4 +1,4 @@
-"""The folder of one sweep: everything it was started with, fixed, and what has become of its runs.
+"""The directory of a sweep: its plan and settings as they were at its start, and the state of each run.
 
 ``<output_dir>/.sweeps/<id>/`` holds ``plan.json``, the runs' settings (``jobs``), a copy of ``conf``, the state of each
 run (``states``) and, once the sweep is to stop, ``stop``. Free of Hydra, so that ``make status`` starts quickly.
@@ -56,11 +56,6 @@ class SweepRun:
     threads: int
     teacher: int | None
     ended: str | None
-
-    @property
-    def label(self) -> str:
-        """The run in words."""
-        return " ".join([*([self.cell] if self.cell else []), self.name, f"seed {self.seed}"])
 
 
 @dataclass(frozen=True)
@@ -140,6 +135,7 @@ class SweepFolder:
             self._held = None
 
     def _hold(self) -> None:
+        # A lock, because a process number may soon belong to somebody else, and because other machines see it too.
         self._held = os.open(self.path / "alive", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         fcntl.flock(self._held, fcntl.LOCK_EX)
 
@@ -169,6 +165,7 @@ class SweepFolder:
 
     def stop(self, at_once: bool) -> None:
         """Tells every worker to end its training: after a checkpoint, or at once."""
+        # A file reaches the workers wherever they are, and those that start later, too.
         (self.path / ("kill" if at_once else "stop")).touch()
 
     @property

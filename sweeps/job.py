@@ -1,4 +1,4 @@
-"""The settings of one run as a file, and the process that trains it."""
+"""The training process of one run: its settings as a file, its start, its stop in good order."""
 
 from __future__ import annotations
 

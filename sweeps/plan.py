@@ -1,4 +1,4 @@
-"""What a sweep has to do: settings in, runs and their order out. Nothing is started or written here."""
+"""Plans a sweep: from settings to runs, teachers before students. Nothing is started or written here."""
 
 from __future__ import annotations
 
@@ -61,6 +61,7 @@ class Plan:
     @property
     def order(self) -> list[int]:
         """The missing runs as they are best taken up: those that others wait for first, then the longest."""
+        # A long run that is begun last keeps one core busy while the others have nothing left to do.
         students = {run.index: 0 for run in self.runs}
         for run in self.missing:
             if run.teacher is not None:
@@ -116,6 +117,7 @@ def make_plan(specs: Sequence[RunSpec]) -> Plan:
     specs = [full_runs.get(spec.directory, spec) for spec in specs]
     listed = {spec.directory: spec for spec in specs}
     ended = {directory: _ended(spec) for directory, spec in listed.items()}
+    # A student that is there needs no teacher any more, even where that was deleted.
     students = [spec for spec in specs if ended[spec.directory] is None]
     teacher_of = {spec.directory: teacher for spec in students if (teacher := _teacher(spec.config)) is not None}
     added = {teacher.directory: teacher for teacher in teacher_of.values() if teacher.directory not in listed}

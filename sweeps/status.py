@@ -1,4 +1,4 @@
-"""What every run is doing: ``python -m sweeps.status [OUTPUT_DIR]``. Exit code 1 if one has failed."""
+"""Prints the state of all runs: ``python -m sweeps.status [OUTPUT_DIR]``. Exit code 1 if one has failed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One sweep from its command line to its last run: plan, launch what is missing, look on, tell what became of it."""
+"""Runs a sweep from its command line to its last run: plans, launches what is missing, shows progress, reports."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sweeps.launchers.base import LauncherAdapter, make_adapter
 from sweeps.launchers.launch import Launch
 from sweeps.plan import Plan, expand, make_plan
 
-#: Seconds between two looks at the jobs, and those beyond the trainings' own that workers have to end.
+#: Seconds between two looks at the jobs; seconds that workers have to end after the trainings had theirs.
 _GLANCE, _MARGIN = 0.5, 10.0
 LOST_REASON = "its worker or its cluster job was killed"
 
@@ -152,6 +152,7 @@ class Sweep:
                 display.say(f"jobs were lost ({one_line(launch.error)}); what they were training is taken up again")
             self._settle()
             number += 1
+            # A launcher that never starts anything would otherwise be called for ever.
             fruitless = fruitless + 1 if before == [self._state(index) for index in runs] else 0
             if fruitless > self._settings.retries:
                 why = f" ({one_line(launch.error)})" if launch.error else ""

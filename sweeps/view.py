@@ -1,4 +1,4 @@
-"""The state of runs and the steps they have left, read from their directories; imports nothing heavy."""
+"""Reads the state of runs from their directories, and estimates the steps they have left; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -108,6 +108,7 @@ def view_entries(
         view = view_run(output_dir / entry.directory, name, entry.seed, entry.total_timesteps, state)
         teacher = views[entry.teacher] if entry.teacher is not None else None
         if teacher is not None and view.state in (WAITING, STOPPED) and teacher.state in (FAILED, DIVERGED, BLOCKED):
+            # The sweep's folder says "waiting", since nobody took it up; nobody will.
             reason = f"waits for its teacher {teacher.name} seed {teacher.seed}, which {_verb(teacher.state)}"
             view = RunStatus(view.name, view.seed, view.directory, BLOCKED, total=view.total, reason=reason)
         views.append(view)

@@ -80,11 +80,13 @@ class Worker:
                     promising = promising or self._may_become_ready(index)
                     continue
                 with self._folder.claim(index) as mine:
+                    # Another worker may have trained it to its end since the look at its state.
                     if mine and self._folder.state(index).state not in FINAL:
                         self._train(index)
                         return True
             if not promising:
                 return False
+            # Files are looked at again and again, since workers of other machines can send no signals.
             time.sleep(_PAUSE)
         return False
 
@@ -121,15 +123,18 @@ class Worker:
             if outcome in (*ENDED, STOPPED):
                 self._folder.set_state(index, replace(state, state=outcome, reason=""))
                 return
+            # Held by a training whose worker was killed: it will end by itself, which is no failure of this run.
             if code == HELD and time.monotonic() - held_since < PATIENCE and not self._is_over():
                 time.sleep(_PAUSE)
                 continue
             state = State(FAILED, state.failures + 1, _reason(code, words))
+            # What was refused once will be refused again.
             final = code in (REFUSED, HELD) or state.failures > self._retries
             if not final:
                 again = f"attempt {state.failures + 1} of {self._retries + 1} after: {state.reason}"
                 state = replace(state, state=STOPPED, reason=again)
             self._folder.set_state(index, state)
+            # A cluster's job that somebody ended must not begin the run anew; the sweep launches another one.
             if final or (bound and code in _ENDED_FROM_OUTSIDE):
                 return
 

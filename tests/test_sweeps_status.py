@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -153,15 +154,16 @@ def test_one_claim_at_a_time_and_none_outlives_its_process(tmp_path):
         assert mine
 
 
-def test_a_thousand_runs_take_less_than_three_seconds(tmp_path):
+def test_a_thousand_runs_take_less_than_two_seconds_of_cpu(tmp_path):
     entries = [entry(index) for index in range(1000)]
     folder = sweep(tmp_path, *entries)
     for index in range(0, 1000, 2):
         ended(tmp_path / entries[index].directory)
         heartbeat(tmp_path / entries[index + 1].directory)
         folder.set_state(index + 1, State(RUNNING))
-    before = time.monotonic()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     told = subprocess.run([sys.executable, "-m", "sweeps.status", str(tmp_path)], capture_output=True, text=True)
-    assert time.monotonic() - before < 3
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 2
     assert told.returncode == 0, told.stderr
     assert "1000 runs: 500 complete, 500 running" in told.stdout

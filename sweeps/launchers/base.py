@@ -1,4 +1,4 @@
-"""What a sweep asks of a launcher, and the choice of one by ``hydra/launcher=NAME``."""
+"""The interface between a sweep and its launcher, and the choice of one by ``hydra/launcher=NAME``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One launch: the launcher at work in a thread of its own, so that somebody can look on and stop it."""
+"""One launch of jobs, in a thread of its own: Hydra's launchers return only when all jobs have ended."""
 
 from __future__ import annotations
 
