@@ -64,6 +64,8 @@ class EnvConfig:
 class SACConfig:
     """Soft Actor-Critic, with the paper's values (docs/paper.md)."""
 
+    #: The learner, a file in ``conf/agent`` and a module in ``acmr/agent``.
+    name: str = "sac"
     #: Width of each hidden layer, in the actor as in the critics.
     hidden_sizes: list[int] = field(default_factory=lambda: [256, 256])
     #: Discount of future rewards, per step.
@@ -90,6 +92,8 @@ class SACConfig:
     alpha: float = 0.2
     #: Of matrix products: float32 or bfloat16. Weights and optimizers are in float32 either way.
     precision: str = PRECISIONS[0]
+    #: Free room for the settings of learners that are added.
+    options: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass

@@ -75,7 +75,7 @@ def test_python_defaults_say_what_the_files_of_the_paper_say():
     """Every value that the paper's files state; a setting of their own that Python knows nothing of fails, too."""
     profile, agent = (yaml.safe_load((CONFIG_FOLDER / f).read_text()) for f in ("profile/paper.yaml", "agent/sac.yaml"))
     said, defaults = flatten(profile) | flatten({"agent": agent}), schema_defaults()
-    assert len(said) == 19
+    assert len(said) == 20
     for key, value in said.items():
         # PyYAML takes 3e-4, without a point, for a text.
         assert (float(value) if key.endswith("_lr") else value) == defaults[key], key

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.learner import METRIC_NAMES
 from acmr.agent.networks import Networks
 from acmr.agent.replay_buffer import Batch
-from acmr.agent.sac import METRIC_NAMES, SAC
+from acmr.agent.sac import SAC
 from acmr.config import SACConfig, TransferConfig
 from acmr.transfer.methods import transfer
 

@@ -5,7 +5,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from reference_sac import ReferenceSAC
 
 from acmr.agent.architecture import Architecture, Dimensions
 from acmr.agent.kernels import arrays
@@ -13,6 +12,7 @@ from acmr.agent.networks import Networks
 from acmr.agent.precision import use_fast_float32
 from acmr.agent.replay_buffer import Batch
 from acmr.agent.sac import SAC
+from acmr.agent.sac_plain import PlainSAC
 from acmr.config import SACConfig, TransferConfig
 from acmr.transfer.methods import transfer
 
@@ -82,7 +82,7 @@ def assert_same_course(make: Callable[[], Networks], config: SACConfig, updates:
     with MKL's products and with oneDNN's differ by up to 5e-3 at the paper's shape after 100 updates (norm), so that
     float32 is compared on smaller networks, and the paper's shape in float64, element by element.
     """
-    fast, plain = (kind(make(), config, generator(1), generator(2)) for kind in (SAC, ReferenceSAC))
+    fast, plain = (kind(make(), config, generator(1), generator(2)) for kind in (SAC, PlainSAC))
     start = {name: value.clone() for name, value in plain.networks.state_dict().items()}
     for step in range(1, updates + 1):
         batch = make_batch(plain.networks.dims, step, config.batch_size)
@@ -101,7 +101,7 @@ def assert_same_course(make: Callable[[], Networks], config: SACConfig, updates:
         assert mean == pytest.approx(theirs[name], rel=1e-3, abs=1e-4, nan_ok=True), name
 
 
-def compared(fast: SAC, plain: ReferenceSAC) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+def compared(fast: SAC, plain: PlainSAC) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
     pairs = {"log_alpha": (fast.log_alpha, plain.log_alpha.detach())}
     for part in ("networks", "targets"):
         got, wanted = (getattr(learner, part).state_dict() for learner in (fast, plain))

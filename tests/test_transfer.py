@@ -16,7 +16,7 @@ from acmr.config import ConfigError, TransferConfig, TransferRules, differing_ke
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.run_spec import specify
 from acmr.transfer import methods
-from acmr.transfer.methods import method, method_names, transfer
+from acmr.transfer.methods import METHODS, method, transfer
 from acmr.transfer.teacher import load_teacher
 
 SOURCE, TARGET = Dimensions(12, 5), Dimensions(8, 3)
@@ -121,7 +121,7 @@ def test_unknown_method_is_refused(teacher_factory):
 
 
 def test_a_method_may_take_other_widths_and_another_body_if_its_rules_do_not_forbid_it(teacher_factory, monkeypatch):
-    monkeypatch.setattr(methods, "_METHODS", {"biases": lambda networks, *_: (networks, ["actor.mean"])})
+    monkeypatch.setattr(methods.METHODS, "_entries", {"biases": lambda networks, *_: (networks, ["actor.mean"])})
     teacher, free = teacher_factory(SOURCE, (10, 8)), TransferRules(same_widths=False)
     assert run(TARGET, teacher, "biases", rules=free)[1].copied == ["actor.mean"]
     for broken in (TransferRules(), TransferRules(same_widths=False, same_body=True)):
@@ -130,8 +130,8 @@ def test_a_method_may_take_other_widths_and_another_body_if_its_rules_do_not_for
 
 
 def test_methods_that_are_named_instead_exist():
-    for name in method_names():
-        assert set(settings(name).rules.instead) <= set(method_names()) - {name}
+    for name in METHODS.names:
+        assert set(settings(name).rules.instead) <= set(METHODS.names) - {name}
 
 
 def names_it(path: Path, name: str) -> bool:
@@ -148,8 +148,8 @@ def test_nobody_but_the_methods_knows_a_methods_name(name):
     sources = [path for folder in ("acmr", "sweeps") for path in (root / folder).rglob("*.py")]
     assert len(sources) > 50
     knows = {str(path.relative_to(root)) for path in sources if names_it(path, name)}
-    # The records say which method each of the paper's cells has.
-    assert knows <= {"acmr/transfer/methods.py", "acmr/records.py"}
+    # The rows of the cells say which method each has.
+    assert knows <= {"acmr/transfer/methods.py", "acmr/cells.py"}
 
 
 def test_rules_are_no_settings():
@@ -182,11 +182,11 @@ def test_published_teachers_are_read_and_described_as_they_were():
 
 
 def test_every_method_has_a_yaml_file_and_the_other_way_round():
-    assert sorted(path.stem for path in (CONFIG_FOLDER / "transfer").glob("*.yaml")) == sorted(method_names())
+    assert sorted(path.stem for path in (CONFIG_FOLDER / "transfer").glob("*.yaml")) == sorted(METHODS.names)
 
 
 def test_a_new_method_is_one_function(teacher_factory, monkeypatch):
-    monkeypatch.setattr(methods, "_METHODS", dict(methods._METHODS))
+    monkeypatch.setattr(methods.METHODS, "_entries", dict(methods.METHODS._entries))
 
     @method("heads")
     def heads(networks, teacher, config, generator):

@@ -1,7 +1,8 @@
 """Soft Actor-Critic (Haarnoja et al. 2018) as the paper ran it.
 
 The passes through the networks are written out (:mod:`acmr.agent.kernels.layers`) and share what they can without
-changing a value; ``tests/reference_sac.py`` says the same plainly, with autograd, and the tests hold the two together.
+changing a value; :mod:`acmr.agent.sac_plain` says the same plainly, with autograd: read that first. The tests hold the
+two together.
 """
 
 from __future__ import annotations
@@ -15,18 +16,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from acmr.agent.kernels.arrays import Array, array_of, math_of, tensor_of
+from acmr.agent.kernels.arrays import array_of, math_of, tensor_of
 from acmr.agent.kernels.layers import CriticStack, Stack, columns
 from acmr.agent.kernels.parameters import Adam, FlatParameters, Group
 from acmr.agent.kernels.policy import NumpyPolicy, Sample, SquashedGaussian
+from acmr.agent.learner import Means, learner, load_tensors
 from acmr.agent.networks import Actor, Critic, Networks, Trunk
 from acmr.agent.replay_buffer import Batch, JoinedBatch
-from acmr.config import SACConfig
-
-#: What :meth:`SAC.metrics` reports: means over the updates since it was last asked.
-METRIC_NAMES = ("critic_loss", "actor_loss", "alpha_loss", "q_value_1", "q_value_2", "alpha", "entropy")
+from acmr.config import PRECISIONS, SACConfig
 
 
+@learner("sac")
 class SAC:
     """Learns networks from batches of transitions.
 
@@ -42,6 +42,8 @@ class SAC:
         log_alpha: Initial log of the temperature.
         device: Where the networks live.
     """
+
+    precisions = PRECISIONS
 
     def __init__(
         self,
@@ -67,8 +69,7 @@ class SAC:
             "critics": Adam(self._critic_parameters.trainable, self._critic_parameters.gradient, config.q_lr),
             "log_alpha": Adam(self.log_alpha, self._log_alpha_gradient, config.q_lr),
         }
-        self._sums: dict[str, Any] = dict.fromkeys(METRIC_NAMES, 0.0)
-        self._counts = dict.fromkeys(METRIC_NAMES, 0)
+        self._means = Means()
         self._batch_size = 0
 
     def _build_networks(self) -> None:
@@ -120,21 +121,14 @@ class SAC:
 
     def metrics(self) -> dict[str, float]:
         """Means over the updates since the last call; NaN where there were none."""
-        means = {
-            name: float(total) / self._counts[name] if self._counts[name] else float("nan")
-            for name, total in self._sums.items()
-        }
-        self._sums = dict.fromkeys(METRIC_NAMES, 0.0)
-        self._counts = dict.fromkeys(METRIC_NAMES, 0)
-        return means
+        return self._means.take()
 
     def state_dict(self) -> dict[str, Any]:
         """All that the following updates and actions depend on, as copies."""
         return {
             "tensors": {name: tensor.clone() for name, tensor in self._state_tensors().items()},
             "generators": {name: generator.get_state() for name, generator in self._generators.items()},
-            "metric_sums": {name: float(total) for name, total in self._sums.items()},
-            "metric_counts": dict(self._counts),
+            **self._means.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -143,19 +137,12 @@ class SAC:
         Raises:
             ValueError: If the state is of another agent: names or sizes differ.
         """
-        tensors = self._state_tensors()
-        given = {name: tuple(tensor.shape) for name, tensor in state["tensors"].items()}
-        wanted = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-        if given != wanted:
-            differing = sorted(name for name in given.keys() | wanted.keys() if given.get(name) != wanted.get(name))
-            raise ValueError(f"the state is of another agent: {', '.join(differing)} differ")
-        for name, tensor in tensors.items():
-            tensor.copy_(state["tensors"][name])
+        load_tensors(self._state_tensors(), state["tensors"])
         for parameters in (self._actor_parameters, self._critic_parameters, self._target_parameters):
             parameters.refresh()
         for name, generator in self._generators.items():
             generator.set_state(state["generators"][name])
-        self._sums, self._counts = dict(state["metric_sums"]), dict(state["metric_counts"])
+        self._means.load_state_dict(state)
 
     def _state_tensors(self) -> dict[str, Tensor]:
         moments = {
@@ -212,7 +199,7 @@ class SAC:
         self._optimizers["critics"].step()
         self._critic_parameters.refresh()
         losses, means = (errors * errors) @ self._average, values @ self._average
-        self._record(critic_loss=losses[0] + losses[1], q_value_1=means[0], q_value_2=means[1])
+        self._means.add(critic_loss=losses[0] + losses[1], q_value_1=means[0], q_value_2=means[1])
 
     def _update_actor_and_temperature(self, observations: Tensor) -> None:
         updates = self.config.policy_frequency
@@ -240,7 +227,7 @@ class SAC:
         self._optimizers["actor"].step()
         self._actor_parameters.refresh()
         log_prob, value = sample.log_prob @ self._average, self._math.minimum(first, second) @ self._average
-        self._record(actor_loss=alpha[0] * log_prob - value, entropy=-log_prob)
+        self._means.add(actor_loss=alpha[0] * log_prob - value, entropy=-log_prob)
 
     def _update_temperature(self, sample: Sample) -> None:
         loss = -self._alpha_array[0] * (sample.log_prob @ self._average + self.target_entropy)
@@ -248,12 +235,7 @@ class SAC:
         array_of(self._log_alpha_gradient)[...] = loss
         self._optimizers["log_alpha"].step()
         torch.exp(self.log_alpha, out=self._alpha)
-        self._record(alpha_loss=loss, alpha=self._alpha_array[0])
-
-    def _record(self, **values: Array) -> None:
-        for name, value in values.items():
-            self._sums[name] = self._sums[name] + value
-            self._counts[name] += 1
+        self._means.add(alpha_loss=loss, alpha=self._alpha_array[0])
 
 
 def _actor_groups(actor: Actor) -> list[Group]:

@@ -12,7 +12,6 @@ import torch
 from acmr.agent.precision import MatmulPrecision, choose_products
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.agent.replay_files import BufferFiles
-from acmr.agent.sac import SAC
 from acmr.config import THRESHOLD, flatten, is_neutral, schema_defaults
 from acmr.envs import make_env
 from acmr.envs.physics import PhysicsWarnings, no_log_file
@@ -124,7 +123,7 @@ class Session:
         env, logs = PhysicsWarnings(make_env(config.env)), RunLogs(self.run_dir, about)
         trainer = Trainer(
             env=env,
-            agent=SAC(
+            agent=prepared.learner(
                 prepared.networks, config.agent, streams.acting, streams.learning, prepared.log_alpha, config.device
             ),
             buffer=ReplayBuffer(config.agent.buffer_size, dims.observation, dims.action, config.device),

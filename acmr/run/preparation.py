@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import torch
 
 from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.learner import Learner, find_learner
 from acmr.agent.networks import Networks
 from acmr.agent.replay_files import replay_bytes
 from acmr.config import ConfigError, ExperimentConfig
@@ -37,6 +39,7 @@ class Prepared:
     about: EnvDescription
     networks: Networks
     report: TransferReport
+    learner: Callable[..., Learner]
     log_alpha: float
     streams: RandomStreams
 
@@ -46,6 +49,7 @@ def prepare(spec: RunSpec) -> Prepared:
     config = spec.config
     _check_device(config.device)
     tracker_class(config.tracking)
+    learner = find_learner(config.agent)
     about = describe(config.env)
     dims = Dimensions(len(about.observation_names), len(about.action_names))
     teacher = find_teacher(config, dims)
@@ -55,7 +59,7 @@ def prepare(spec: RunSpec) -> Prepared:
     networks, report = transfer(fresh, teacher, config.transfer, config.freeze, streams.networks)
     copied_alpha = teacher is not None and config.transfer.copy_log_alpha
     log_alpha = teacher.description.log_alpha if teacher is not None and copied_alpha else 0.0
-    return Prepared(spec, about, networks, report, log_alpha, streams)
+    return Prepared(spec, about, networks, report, learner, log_alpha, streams)
 
 
 def find_teacher(config: ExperimentConfig, dims: Dimensions) -> Teacher | None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from acmr.agent.sac import METRIC_NAMES
+from acmr.agent.learner import METRIC_NAMES
 from acmr.envs import EnvDescription
 from acmr.records import (
     EPISODE_COLUMNS,

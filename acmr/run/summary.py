@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from acmr.agent.sac import SAC
+from acmr.agent.learner import Learner
 from acmr.config import THRESHOLD
 from acmr.envs import EnvDescription
 from acmr.records import COMPLETE, DIVERGED, EpisodeRecord, steps_to_threshold
@@ -66,7 +66,7 @@ def summarize(
 
 
 def describe_teacher(
-    spec: RunSpec, about: EnvDescription, agent: SAC, summary: Mapping[str, Any]
+    spec: RunSpec, about: EnvDescription, agent: Learner, summary: Mapping[str, Any]
 ) -> TeacherDescription:
     """What the file of the final networks says of them.
 

@@ -11,8 +11,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from acmr.agent.learner import Learner
 from acmr.agent.replay_buffer import ReplayBuffer
-from acmr.agent.sac import SAC
 from acmr.records import EpisodeInProgress
 from acmr.run.random_streams import RandomStreams
 from acmr.tracking.observer import Observer
@@ -54,7 +54,7 @@ class Trainer:
     """
 
     env: gym.Env[np.ndarray, np.ndarray]
-    agent: SAC
+    agent: Learner
     buffer: ReplayBuffer
     streams: RandomStreams
     total_timesteps: int
@@ -139,7 +139,7 @@ class Trainer:
         return self.streams.exploration.uniform(space.low, space.high).astype(np.float32)
 
 
-def is_finite(agent: SAC) -> bool:
+def is_finite(agent: Learner) -> bool:
     """Whether all weights, targets, moments and sums of a learner are finite."""
     state = agent.state_dict()
     sums = all(map(math.isfinite, state["metric_sums"].values()))

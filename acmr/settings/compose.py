@@ -160,12 +160,12 @@ def launchers() -> list[str]:
 
 
 @lru_cache(maxsize=256)
-def baseline(profile: str, env: str, env_id: str, transfer: str) -> dict[str, Any]:
-    """The settings, flat, that a profile has for an environment and a transfer where nothing else is said.
+def baseline(profile: str, env: str, env_id: str, agent: str, transfer: str) -> dict[str, Any]:
+    """The settings, flat, that a profile has for these choices where nothing else is said.
 
     With the rules of the method.
     """
-    overrides = [f"profile={profile}", f"transfer={transfer}", *env_overrides(env, env_id)]
+    overrides = [f"profile={profile}", f"agent={agent}", f"transfer={transfer}", *env_overrides(env, env_id)]
     return flatten(asdict(parse(compose_config(overrides))))
 
 

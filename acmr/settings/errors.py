@@ -19,7 +19,7 @@ from acmr.settings.compose import as_override, groups, launchers, options, setti
 from acmr.text import message
 
 #: Settings whose entries are free; Hydra adds to them with a plus sign only.
-FREE_KEYS = ("env.kwargs", "transfer.options", "tracking.options")
+FREE_KEYS = ("env.kwargs", "agent.options", "transfer.options", "tracking.options")
 #: Settings that are paths. Names of runs hold equal signs, which Hydra's grammar wants quoted.
 PATH_KEYS = ("transfer.teacher", "output_dir", "tracking.dir")
 #: What a wrong command line or a wrong file of ``conf/`` raises.

@@ -8,12 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from acmr.cells import SOURCE, TARGET, cell_of, digest, run_name
-from acmr.config import HORIZON, TEACHER_KEYS, ConfigError, ExperimentConfig, flatten, is_neutral, plain_settings
+from acmr.config import (
+    HORIZON,
+    TEACHER_KEYS,
+    ConfigError,
+    ExperimentConfig,
+    SACConfig,
+    flatten,
+    is_neutral,
+    plain_settings,
+)
 from acmr.records import DESCRIPTION_FILE
 from acmr.settings.compose import as_override, baseline, compose_config, env_overrides, parse
 
 #: Settings that a run's name spells out in its own way.
-_NAMED_KEYS = ("seed", "freeze", "transfer.name", "transfer.teacher", "env.name")
+_NAMED_KEYS = ("seed", "freeze", "agent.name", "transfer.name", "transfer.teacher", "env.name")
 #: What stands in a method's file only.
 _RULES = "transfer.rules."
 
@@ -54,6 +63,8 @@ def specify(config: ExperimentConfig) -> RunSpec:
     """Finds out which run the settings mean."""
     changes = _changes(config)
     shown = dict(changes)
+    if config.agent.name != SACConfig().name:
+        shown["agent"] = config.agent.name
     if config.transfer.teacher is not None:
         shown["transfer.teacher"] = _teacher_mark(config.transfer.teacher)
     kind = (config.transfer.name, config.freeze, shown)
@@ -78,7 +89,7 @@ def teacher_spec(config: ExperimentConfig) -> RunSpec:
 
 
 def _changes(config: ExperimentConfig) -> dict[str, Any]:
-    base = baseline(config.profile, config.env.name, config.env.id, config.transfer.name)
+    base = baseline(config.profile, config.env.name, config.env.id, config.agent.name, config.transfer.name)
     now = flatten(asdict(config))
     changed = {}
     for key in sorted(set(base) | set(now)):
@@ -100,6 +111,8 @@ def _short_overrides(spec: RunSpec) -> list[str]:
     said = [f"profile={config.profile}"] if config.profile != "paper" else []
     if config.env.name != default.env.name:
         said += env_overrides(config.env.name, config.env.id)
+    if config.agent.name != default.agent.name:
+        said.append(f"agent={config.agent.name}")
     if config.transfer.name != default.transfer.name:
         said.append(f"transfer={config.transfer.name}")
     if config.freeze:

@@ -1,8 +1,8 @@
 """Actor-Critic Model Reuse: what a student takes from its teacher, layer by layer (paper, section 3.2).
 
 A method is one function: it takes the student's fresh networks and the teacher, and returns the networks to learn
-with and the names of the layers that came from the teacher. Register it with :func:`method` and add a YAML file of
-the same name under ``conf/transfer/`` with the rules that a teacher and a student must keep (docs/howto-transfer.md).
+with and the names of the layers that came from the teacher. One of your own is a module of its name in this package
+and a YAML file in ``conf/transfer``, with the rules that teacher and student must keep (docs/howto-transfer.md).
 """
 
 from __future__ import annotations
@@ -15,28 +15,16 @@ import torch
 from acmr.agent.architecture import Dimensions, is_hidden
 from acmr.agent.networks import Networks
 from acmr.config import ConfigError, TransferConfig
+from acmr.registry import Registry
 from acmr.transfer.report import TransferReport, report_transfer
 from acmr.transfer.teacher import Teacher
 
 #: Student, teacher (None where the method's rules say that it needs none), settings, source of new weights; returns
 #: the networks to learn with and the names of the layers that hold the teacher's values.
 Method = Callable[[Networks, Any, TransferConfig, torch.Generator], tuple[Networks, list[str]]]
-_METHODS: dict[str, Method] = {}
-
-
-def method(name: str) -> Callable[[Method], Method]:
-    """Registers a transfer method under the name of its YAML file."""
-
-    def register(function: Method) -> Method:
-        _METHODS[name] = function
-        return function
-
-    return register
-
-
-def method_names() -> tuple[str, ...]:
-    """Every transfer there is, ``none`` first."""
-    return tuple(_METHODS)
+METHODS: Registry[Method] = Registry("transfer.name", "acmr.transfer")
+#: Registers a transfer method under the name of its YAML file.
+method = METHODS.add
 
 
 def transfer(
@@ -61,12 +49,11 @@ def transfer(
     Raises:
         ConfigError: If the teacher does not fit the method.
     """
-    if config.name not in _METHODS:
-        raise ConfigError(f"transfer.name={config.name}: must be one of {', '.join(method_names())}")
+    take = METHODS.find(config.name)
     if teacher is not None:
         check_body(config, f"the teacher {teacher.path}", teacher.description.dims, student.dims)
         _check_widths(config, teacher, student)
-    networks, copied = _METHODS[config.name](student, teacher, config, generator)
+    networks, copied = take(student, teacher, config, generator)
     if teacher is not None and not copied:
         raise ConfigError(f"transfer={config.name}: no layer of {teacher.path} could be copied")
     layers = networks.layers()
@@ -93,7 +80,7 @@ def direct(
     about = teacher.description.architecture
     # A teacher that was itself expanded hands on its adapters, too.
     networks = student.with_core(about.core, about.adapter_activation, generator)
-    return networks, _copy(networks, teacher, networks.layers())
+    return networks, copy_layers(networks, teacher, networks.layers())
 
 
 @method("hidden")
@@ -101,7 +88,7 @@ def hidden(
     student: Networks, teacher: Teacher, config: TransferConfig, generator: torch.Generator
 ) -> tuple[Networks, list[str]]:
     """The layers between two hidden activations: no sensor or actuator touches them (A1, A2)."""
-    return student, _copy(student, teacher, filter(is_hidden, student.layers()))
+    return student, copy_layers(student, teacher, filter(is_hidden, student.layers()))
 
 
 @method("expand")
@@ -116,7 +103,7 @@ def expand(
         )
     networks = student.with_core(teacher.description.dims, config.adapter_activation, generator)
     inner = [name for name in networks.layers() if f"{name}.weight" in teacher.tensors]
-    return networks, _copy(networks, teacher, inner)
+    return networks, copy_layers(networks, teacher, inner)
 
 
 def check_body(config: TransferConfig, owner: str, theirs: Dimensions, ours: Dimensions) -> None:
@@ -147,7 +134,7 @@ def _check_widths(config: TransferConfig, teacher: Teacher, student: Networks) -
         )
 
 
-def _copy(networks: Networks, teacher: Teacher, names: Iterable[str]) -> list[str]:
+def copy_layers(networks: Networks, teacher: Teacher, names: Iterable[str]) -> list[str]:
     """Copies layers of the same name and shape; returns their names."""
     layers, copied = networks.layers(), list(names)
     with torch.no_grad():
