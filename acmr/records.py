@@ -103,6 +103,21 @@ class EpisodeInProgress:
         for name in self.terms:
             self.sums[name] += float(info[name])
 
+    def state_dict(self) -> dict[str, Any]:
+        """The sums so far."""
+        return {"length": self.length, "total": self.total, "distance": self.distance, "sums": dict(self.sums)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on with these sums.
+
+        Raises:
+            ValueError: If they are of an environment with other terms.
+        """
+        if state["sums"].keys() != set(self.terms):
+            raise ValueError("an episode with other terms of the reward")
+        self.length, self.total, self.distance = state["length"], state["total"], state["distance"]
+        self.sums = dict(state["sums"])
+
     def record(self, global_step: int) -> EpisodeRecord:
         """The episode, ended at ``global_step``."""
         velocity = self.distance / self.length if self.velocity else None

@@ -15,7 +15,7 @@ from acmr.storage.durable import (
     FileDigest,
     WriteError,
     make_folder,
-    read_marked,
+    read_checked,
     read_regular,
     write_bytes,
 )
@@ -117,13 +117,13 @@ def test_an_appended_file_is_cut_back_to_what_was_marked(tmp_path):
     log = Appender(path)
     for row in range(20):
         log.append(f"{row}\n".encode())
-    mark = log.mark()
+    digest = log.sync()
     log.append(b"torn ro")
     log.close()
-    again = Appender(path, mark)
+    again = Appender(path, digest)
     assert path.read_bytes() == b"".join(f"{row}\n".encode() for row in range(20))
     again.append(b"more\n")
-    assert again.mark() == FileDigest.of(path.read_bytes())
+    assert again.sync() == FileDigest.of(path.read_bytes())
     again.close()
 
 
@@ -132,21 +132,21 @@ def test_an_appended_file_that_was_changed_is_left_as_it_is(damage, tmp_path):
     path = tmp_path / "log"
     log = Appender(path)
     log.append(b"one\ntwo\n")
-    mark = log.mark()
+    digest = log.sync()
     log.close()
     path.write_bytes(damage(path.read_bytes()))
     before = path.read_bytes()
     with pytest.raises(DamagedError, match="log: does not hold what was written to it"):
-        Appender(path, mark)
+        Appender(path, digest)
     assert path.read_bytes() == before
 
 
 def test_a_whole_file_must_hold_nothing_else(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(b"contentmore")
-    assert read_marked(path, FileDigest.of(b"content")) == b"content"
+    assert read_checked(path, FileDigest.of(b"content")) == b"content"
     with pytest.raises(DamagedError, match="11 bytes, at most 7"):
-        read_marked(path, FileDigest.of(b"content"), whole=True)
+        read_checked(path, FileDigest.of(b"content"), whole=True)
 
 
 def test_no_link_is_followed_and_nothing_else_is_read(tmp_path):

@@ -159,36 +159,52 @@ def stopped(tmp_path) -> Run:
 def test_a_checkpoint_that_names_other_files_is_refused(name, stopped):
     store = SnapshotStore(stopped.folder / "checkpoint", 1 << 30)
     snapshot = store.read(80)
-    store.write(80, Snapshot(snapshot.values, snapshot.arrays, {name: next(iter(snapshot.files.values()))}))
+    replay = snapshot.values["state"]["replay"]
+    replay["segments"] = {name: next(iter(replay["segments"].values()))}
+    store.write(80, snapshot)
     ended = stopped()
     assert ended.code == 2
-    assert "not a checkpoint of this run" in ended.said
+    assert "not a part of a replay buffer" in ended.said
 
 
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        ("added", 10**18), ("added", -1), ("added", "1"), ("ended", 10**9), ("global_step", "x"), ("global_step", None),
-        ("episode", []), ("environment", {"random": {"bit_generator": "MT19937"}}), ("learner", {}),
-        ("logs", {"episodes": [10**15, "0"]}), ("replay", {"bit_generator": "PCG64", "state": {"state": -1, "inc": 0}}),
+        ("replay", {"segments": {}}), ("replay", {"segments": []}), ("replay", []), ("replay", {"added": 81}),
+        ("replay", {"added": 10**18}), ("replay", {"added": -1}), ("replay", {"added": "80"}),
+        ("replay", {"segments": {}, "added": -1}),
+        ("replay", {"segments": {"segment_0_80.safetensors": [10**18, "0"]}}),
+        ("replay", {"segments": {"segment_40_40.safetensors": [8, "0"]}}),
+        ("trainer", {"global_step": "x"}), ("trainer", {"global_step": None}), ("episode", []), ("agent", {}),
+        ("episode", {"length": 1, "total": 0.0, "distance": 0.0, "sums": {"other": 0.0}}),
+        ("environment", {"in_episode": False, "random": {"bit_generator": "MT19937"}}), ("environment", 7),
+        ("logs", {"episodes": [10**15, "0"]}), ("logs", {"episodes": [-1, "0"], "metrics": ["0", 0]}),
+        ("streams", {"replay": {"bit_generator": "PCG64", "state": {"state": -1, "inc": 0}}}), ("clock", {}),
+        ("warnings", {"counts": 3}), ("something_else", {}),
     ],
 )  # fmt: skip
 def test_a_checkpoint_with_impossible_values_is_refused(path, value, stopped):
     store = SnapshotStore(stopped.folder / "checkpoint", 1 << 30)
     snapshot = store.read(80)
-    snapshot.values["state"][path] = value
+    state = snapshot.values["state"]
+    state[path] = {**state.get(path, {}), **value} if isinstance(value, dict) and value else value
     store.write(80, snapshot)
+    before = (stopped.folder / "episodes.csv").read_bytes()
     ended = stopped()
     assert ended.code == 2, ended.said
     assert "no checkpoint can be used" in ended.said
+    assert (stopped.folder / "episodes.csv").read_bytes() == before
 
 
 def test_arrays_that_do_not_fit_are_refused(stopped):
     store = SnapshotStore(stopped.folder / "checkpoint", 1 << 30)
     snapshot = store.read(80)
-    for name in ("agent/actor", "observation", "environment/data.xipos"):
-        arrays = snapshot.arrays | {name: np.zeros(3)}
-        store.write(80, Snapshot(snapshot.values, arrays, snapshot.files))
+    names = (
+        "torch/agent/tensors/actor", "numpy/agent/tensors/actor", "numpy/trainer/observation", "numpy/trainer", "numpy",
+        "numpy/environment/robot/data/xipos", "numpy/nobody/x", "numpy/environment/in_episode/x",
+    )  # fmt: skip
+    for name in names:
+        store.write(80, Snapshot(snapshot.values, snapshot.arrays | {name: np.zeros(3)}))
         assert stopped().code == 2, name
 
 
@@ -200,8 +216,8 @@ def test_a_segment_larger_than_the_buffer_is_not_read(stopped):
     path.write_bytes(save_arrays({"rows": np.zeros((10_000, 35), np.float32)}))
     store = SnapshotStore(folder, 1 << 30)
     snapshot = store.read(80)
-    files = {**snapshot.files, path.name: FileDigest.of(path.read_bytes())}
-    store.write(80, Snapshot(snapshot.values, snapshot.arrays, files))
+    snapshot.values["state"]["replay"]["segments"][path.name] = FileDigest.of(path.read_bytes()).to_json()
+    store.write(80, snapshot)
     assert "larger than this run's replay buffer" in stopped().said
 
 

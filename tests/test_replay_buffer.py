@@ -1,6 +1,10 @@
 """The ring against a plain list of whole transitions."""
 
+import copy
+from itertools import pairwise
+
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -57,13 +61,54 @@ def test_only_the_rows_that_the_layout_names_change(before, after, capacity):
     play(buffer, before)
     names = ("rows", "rewards", "terminated", "endings", "last_observations")
     old = {name: getattr(buffer, name).copy() for name in names}
-    added, ended = buffer.added, buffer.ended
+    added, ended = buffer.added, buffer._ended
     play(buffer, after)
     allowed = set(np.arange(added, buffer.added + 1) % (capacity + 1))
-    allowed_last = set(np.arange(ended, buffer.ended) % capacity)
+    allowed_last = set(np.arange(ended, buffer._ended) % capacity)
     for name in names:
         changed = np.flatnonzero((getattr(buffer, name) != old[name]).reshape(len(old[name]), -1).any(1))
         assert set(changed) <= (allowed_last if name == "last_observations" else allowed), name
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    before=episodes,
+    after=episodes,
+    capacity=st.integers(1, 40),
+    pieces=st.integers(1, 5),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_a_buffer_that_takes_the_transitions_of_another_goes_on_as_that_one(before, after, capacity, pieces, seed):
+    buffer, other = ReplayBuffer(capacity, OBSERVATION, ACTION), ReplayBuffer(capacity, OBSERVATION, ACTION)
+    play(other, after)
+    # Its newest transition may be in the middle of an episode.
+    play(buffer, before)
+    buffer.add(np.zeros(OBSERVATION), np.ones(ACTION), 0.5, np.full(OBSERVATION, 0.25), False, False)
+    borders = np.linspace(buffer.oldest, buffer.added, pieces + 1).astype(int)
+    chunks = [buffer.transitions(first, end) for first, end in pairwise(borders) if first < end]
+    other.replace(buffer.oldest, copy.deepcopy(chunks))
+    for _ in range(2):
+        assert (len(other), other.added) == (len(buffer), buffer.added)
+        batches = [one.sample(9, np.random.default_rng(seed)) for one in (buffer, other)]
+        for got, wanted in zip(*map(columns, batches), strict=True):
+            np.testing.assert_array_equal(got, wanted)
+        play(buffer, after)
+        play(other, after)
+
+
+def test_transitions_that_do_not_fit_are_refused():
+    buffer = ReplayBuffer(10, OBSERVATION, ACTION)
+    play(buffer, [(4, True), (9, False), (3, True)])
+    first, whole = buffer.oldest, buffer.transitions(buffer.oldest, buffer.added)
+    assert first == 6
+    for name, array in whole.items():
+        if name != "ended":
+            with pytest.raises(ValueError, match="of shape"):
+                ReplayBuffer(10, OBSERVATION, ACTION).replace(first, [whole | {name: array[:1, ..., None]}])
+    with pytest.raises(ValueError, match="a part of the replay buffer is missing"):
+        buffer.replace(8, [buffer.transitions(8, 16)])
+    with pytest.raises(ValueError, match="more transitions than the replay buffer keeps"):
+        ReplayBuffer(9, OBSERVATION, ACTION).replace(first, [whole])
 
 
 def test_every_kept_transition_is_drawn_equally_often():

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from torture import ANT, HUMANOID, SMALL, Run, at_step, same
 
-from acmr.storage.checkpoint_store import SnapshotStore
+from acmr.storage.checkpoint_store import Snapshot, SnapshotStore
 
 PENDULUM = ("env=gym", "env.id=Pendulum-v1", "env.max_episode_steps=30", "total_timesteps=220", *SMALL)
 KINDS = {"humanoid": HUMANOID, "ant": ANT, "pendulum": PENDULUM}
@@ -126,7 +126,7 @@ def edit(run: Run, step: int, **entries: object) -> None:
     """Changes entries of a checkpoint, with the hash that belongs to them."""
     store = SnapshotStore(run.folder / "checkpoint", 1 << 30)
     snapshot = store.read(step)
-    store.write(step, snapshot.with_values(snapshot.values | entries))
+    store.write(step, Snapshot(snapshot.values | entries, snapshot.arrays))
 
 
 def test_another_machine_is_refused_unless_asked_for_and_recorded(stopped):
@@ -148,6 +148,24 @@ def test_another_number_of_threads_is_another_machine(stopped):
     ended = stopped(lambda: None, "threads=2")
     assert ended.code == 2
     assert "made under other conditions: threads 1 (now 2)" in ended.said
+
+
+def test_checkpoints_of_another_format_are_refused_in_one_line(stopped):
+    kept = {}
+    for path in (stopped.folder / "checkpoint").glob("step_*.json"):
+        # What the version before wrote there is of no interest, since nothing of it is read.
+        kept[path] = path.read_bytes().replace(b'"format_version": 2', b'"format_version": 1')
+        path.write_bytes(kept[path])
+    ended = stopped()
+    assert ended.code == 2
+    (error,) = [line for line in ended.said.splitlines() if line.startswith("error: ")]
+    latest = stopped.folder / "checkpoint" / "step_120.json"
+    command = f"python run.py {' '.join(stopped.spec.command.split()[2:])} force=true"
+    assert error == (
+        f"error: a checkpoint of another version of this program, which can finish this run: {latest}: format 1 (this "
+        f"version reads 2); to start from the first step again, type: {command}"
+    )
+    assert {path: path.read_bytes() for path in kept} == kept
 
 
 def test_a_checkpoint_of_another_run_is_refused(stopped, tmp_path):
@@ -191,7 +209,7 @@ def test_without_checkpoints_a_run_begins_anew(tmp_path, untouched):
 
 def test_seconds_are_those_of_all_processes(stopped):
     state = SnapshotStore(stopped.folder / "checkpoint", 1 << 30).read(120).values["state"]
-    edit(stopped, 120, state=state | {"wall_seconds": 1e6})
+    edit(stopped, 120, state=state | {"clock": {"seconds": 1e6}})
     stopped.finish()
     assert 1e6 < json.loads((stopped.folder / "summary.json").read_text())["wall_seconds"] < 1e6 + 600
 

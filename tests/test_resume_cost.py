@@ -24,15 +24,17 @@ def test_checkpoints_take_under_two_percent_of_a_paper_run_and_under_2_5_gb(tmp_
     trainer.observation, _ = trainer.env.reset(seed=1)
     # The memory of numbers that are never the same costs what it costs in a run.
     noise = np.random.default_rng(0).standard_normal((25_000, buffer.rows.shape[1])).astype(np.float32)
+    ended = np.zeros(len(noise), np.uint8)
+    # An episode of a young policy takes 25 steps.
+    ended[24::25] = 1
+    chunk = {
+        "rows": noise, "rewards": noise[:, 0], "terminated": noise[:, 1], "ended": ended,
+        "last_observations": noise[: ended.sum(), :376], "next_observation": noise[0, :376],
+    }  # fmt: skip
     took, most = [], 0
     for step in range(25_000, config.total_timesteps + 1, 25_000):
-        rows = np.arange(step - 25_000, step)
-        buffer.rows[rows], buffer.rewards[rows] = noise, noise[:, 0]
-        # An episode of a young policy takes 25 steps.
-        ends = rows[24::25]
-        buffer.endings[ends] = np.arange(buffer.ended, buffer.ended + len(ends))
-        buffer.last_observations[buffer.ended : buffer.ended + len(ends)] = noise[: len(ends), :376]
-        buffer.added, buffer.ended, trainer.global_step = step, buffer.ended + len(ends), step
+        buffer._extend(chunk)
+        trainer.global_step = step
         began = time.perf_counter()
         assert checkpoints.save()
         took.append(time.perf_counter() - began)

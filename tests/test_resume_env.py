@@ -4,14 +4,16 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 
 from acmr.config import EnvConfig
 from acmr.envs import make_env
 from acmr.envs.physics import PhysicsWarnings
-from acmr.envs.state import ANYTIME, BETWEEN_EPISODES, NEVER, EnvState, capture, data_arrays, rehearse, restore
+from acmr.envs.state import ANYTIME, BETWEEN_EPISODES, NEVER, RestorableEnv, capture, data_arrays, rehearse, restore
 from acmr.settings.compose import environment_config
+from acmr.stateful import State
 
 OURS = ("humanoid", "armless_humanoid", "humanoid_v5", "armless_humanoid_v5", "ant", "ant_three_legs")
 ROBOTS = (
@@ -44,7 +46,7 @@ def actions_for(env: gym.Env, count: int, seed: int = 3) -> np.ndarray:
     return np.random.default_rng(seed).uniform(low, high, (count, *low.shape)).astype(np.float32)
 
 
-def twin(config: EnvConfig, state: EnvState) -> gym.Env:
+def twin(config: EnvConfig, state: State) -> gym.Env:
     env = make_env(config)
     env.reset(seed=99)
     play(env, actions_for(env, 5, seed=4))
@@ -60,7 +62,7 @@ def test_every_robot_goes_on_exactly_from_any_step(name):
     actions = actions_for(env, 90)
     play(env, actions[:7])
     for first in (7, 30):
-        state = capture(env, within_episode=True)
+        state = capture(env, in_episode=True)
         other = twin(config, state)
         arrays = {array: getattr(env.unwrapped.data, array).copy() for array in data_arrays(env.unwrapped.model)}
         for array, content in arrays.items():
@@ -75,17 +77,15 @@ def test_mujocos_own_state_alone_gives_wrong_rewards():
     env.reset(seed=1)
     actions = actions_for(env, 12)
     play(env, actions[:8])
-    whole = capture(env, within_episode=True)
+    whole = capture(env, in_episode=True)
     fresh = make_env(config)
     fresh.reset(seed=99)
-    stale = {f"data.{name}": getattr(fresh.unwrapped.data, name).copy() for name in data_arrays(fresh.unwrapped.model)}
-    kept = {"integration": whole.arrays["integration"]}
-    kept |= {name: array for name, array in whole.arrays.items() if name.startswith("attribute.")}
+    stale = {name: getattr(fresh.unwrapped.data, name).copy() for name in data_arrays(fresh.unwrapped.model)}
     # What the integration state itself holds may not be put back to the values of another moment.
     for name in ("qpos", "qvel", "ctrl", "qacc_warmstart", "qfrc_applied", "xfrc_applied", "act"):
-        if f"data.{name}" in whole.arrays:
-            stale[f"data.{name}"] = whole.arrays[f"data.{name}"]
-    alone = twin(config, EnvState(whole.values, stale | kept))
+        if name in stale:
+            stale[name] = whole["robot"]["data"][name]
+    alone = twin(config, whole | {"robot": whole["robot"] | {"data": stale}})
     got, wanted = alone.step(actions[8]), env.step(actions[8])
     np.testing.assert_array_equal(got[0], wanted[0])
     assert got[1] != wanted[1]
@@ -120,7 +120,27 @@ def test_between_episodes_the_random_numbers_are_enough(name):
     env.reset(seed=1)
     actions = actions_for(env, 60)
     play(env, actions[:9])
-    other = twin(config, capture(env, within_episode=False))
+    other = twin(config, capture(env, in_episode=False))
+    np.testing.assert_array_equal(other.reset()[0], env.reset()[0])
+    assert same(play(other, actions), play(env, actions))
+
+
+@pytest.mark.parametrize("name", ["humanoid", "Pendulum-v1"])
+def test_it_knows_by_itself_whether_an_episode_is_under_way(name):
+    config = environment_config(name)
+    config.max_episode_steps = 12
+    env, actions = RestorableEnv(make_env(config)), actions_for(make_env(config), 40)
+    other = RestorableEnv(make_env(config))
+    env.reset(seed=1)
+    assert env.state_dict()["in_episode"]
+    ended = False
+    for action in actions[:12]:
+        if not ended:
+            ended = any(env.step(action)[2:4])
+    state = env.state_dict()
+    assert set(state) == {"in_episode", "random", "layers"}
+    other.load_state_dict(state)
+    assert not other.state_dict()["in_episode"]
     np.testing.assert_array_equal(other.reset()[0], env.reset()[0])
     assert same(play(other, actions), play(env, actions))
 
@@ -175,6 +195,43 @@ gym.register("AcmrHiding-v0", Hiding, max_episode_steps=50)
 gym.register("AcmrGrowing-v0", Growing, max_episode_steps=50)
 
 
+class Telling(Hiding):
+    """Hides it, and says itself what it is."""
+
+    def state_dict(self):
+        return {"box": list(self.box)}
+
+    def load_state_dict(self, state):
+        self.box = state["box"]
+
+
+class Counting(gym.Wrapper):
+    """Adds to each reward how many steps it has seen in all episodes."""
+
+    seen = 0
+
+    def step(self, action):
+        self.seen += 1
+        observation, reward, *rest = super().step(action)
+        return observation, float(reward) + self.seen, *rest
+
+
+class Counted(Counting):
+    """Says itself how many."""
+
+    def state_dict(self):
+        return {"seen": self.seen}
+
+    def load_state_dict(self, state):
+        self.seen = state["seen"]
+
+
+gym.register("AcmrTelling-v0", Telling, max_episode_steps=50)
+gym.register("AcmrCounting-v0", lambda **kwargs: Counting(HopperEnv(**kwargs)), max_episode_steps=50)
+gym.register("AcmrCounted-v0", lambda **kwargs: Counted(HopperEnv(**kwargs)), max_episode_steps=50)
+gym.register("AcmrCountedPendulum-v0", lambda **kwargs: Counted(PendulumEnv(**kwargs)), max_episode_steps=20)
+
+
 @pytest.mark.parametrize(
     ("name", "when"),
     [
@@ -183,6 +240,10 @@ gym.register("AcmrGrowing-v0", Growing, max_episode_steps=50)
         ("AcmrHiding-v0", BETWEEN_EPISODES),
         ("AcmrGrowing-v0", NEVER),
         ("Pendulum-v1", BETWEEN_EPISODES),
+        ("AcmrTelling-v0", ANYTIME),
+        ("AcmrCounting-v0", NEVER),
+        ("AcmrCounted-v0", ANYTIME),
+        ("AcmrCountedPendulum-v0", BETWEEN_EPISODES),
     ],
 )
 def test_a_rehearsal_finds_out_when_an_environment_can_be_stored(name, when):
@@ -195,14 +256,15 @@ def test_a_rehearsal_finds_out_when_an_environment_can_be_stored(name, when):
 def test_a_state_that_does_not_fit_is_refused():
     env = make_env(environment_config("ant"))
     env.reset(seed=1)
-    state = capture(env, within_episode=True)
-    for arrays in (
-        {name: array for name, array in state.arrays.items() if name != "data.xipos"},
-        {name: array[:-1] for name, array in state.arrays.items()},
-        {name: array for name, array in state.arrays.items() if name != "integration"},
+    state = capture(env, in_episode=True)
+    robot = state["robot"]
+    for wrong in (
+        robot | {"data": {name: array for name, array in robot["data"].items() if name != "xipos"}},
+        robot | {"data": {name: array[:-1] for name, array in robot["data"].items()}},
+        {name: part for name, part in robot.items() if name != "integration"},
     ):
         with pytest.raises((KeyError, ValueError, TypeError)):
-            restore(make_env(environment_config("ant")), EnvState(state.values, arrays))
+            restore(make_env(environment_config("ant")), state | {"robot": wrong})
 
 
 def test_warnings_of_the_simulation_are_counted_and_leave_no_file(tmp_path, monkeypatch):

@@ -18,8 +18,6 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
-import numpy as np
-
 import acmr.run.experiment as experiment
 from acmr.agent.precision import MatmulPrecision, choose_products
 from acmr.agent.replay_buffer import ReplayBuffer
@@ -200,14 +198,10 @@ def without_speed(metrics: bytes) -> bytes:
 
 def content_hash(buffer: ReplayBuffer) -> str:
     """Hash of every transition that may be drawn, oldest first."""
-    numbers = np.arange(buffer.added - len(buffer), buffer.added)
-    rows = numbers % len(buffer.rows)
-    following = buffer.rows[(rows + 1) % len(buffer.rows), : buffer.observation_dim].copy()
-    endings = buffer.endings[rows]
-    following[endings >= 0] = buffer.last_observations[endings[endings >= 0]]
-    parts = (buffer.rows[rows], buffer.rewards[rows], buffer.terminated[rows], endings, following)
-    numbers_too = f"{buffer.added} {buffer.ended}".encode()
-    return hashlib.sha256(b"".join(part.tobytes() for part in parts) + numbers_too).hexdigest()
+    kept = buffer.transitions(buffer.oldest, buffer.added)
+    return hashlib.sha256(
+        b"".join(kept[name].tobytes() for name in sorted(kept)) + str(buffer.added).encode()
+    ).hexdigest()
 
 
 def die() -> None:

@@ -1,9 +1,13 @@
-"""The replay buffer on disk: what was added since the last checkpoint goes to one more file that never changes."""
+"""The replay buffer on disk: what was added since the last checkpoint goes to one more file that never changes.
+
+A buffer of 1.6 GB cannot be written anew at each checkpoint. Nor can it be one file that is overwritten as the ring in
+memory is: once that has wrapped, the latest rows lie where older ones did that the checkpoint before still needs.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +18,10 @@ from safetensors.numpy import save as save_arrays
 
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.records import DamagedError
-from acmr.storage.durable import FileDigest, read_marked, write_bytes
+from acmr.stateful import State
+from acmr.storage.durable import FileDigest, read_checked, write_bytes
 
+# Digits are limited so that a name from somebody else's checkpoint is never a number that fills the memory.
 _NAME = re.compile(r"segment_(\d{1,15})_(\d{1,15})\.safetensors")
 #: Bytes that a segment takes beside its numbers.
 _HEADER_BYTES = 4096
@@ -27,15 +33,28 @@ class Segment:
 
     first: int
     end: int
-    mark: FileDigest
+    digest: FileDigest
 
     @property
     def name(self) -> str:
         """The file's name."""
         return f"segment_{self.first}_{self.end}.safetensors"
 
+    @staticmethod
+    def named(name: str, digest: FileDigest) -> Segment:
+        """The segment that a file is by its name.
 
-class BufferFiles:
+        Raises:
+            DamagedError: If it is none.
+        """
+        match = _NAME.fullmatch(name)
+        # The name becomes a path, so nothing but such a name may get any further.
+        if not match or int(match[1]) >= int(match[2]):
+            raise DamagedError(f"{name}: not a part of a replay buffer")
+        return Segment(int(match[1]), int(match[2]), digest)
+
+
+class ReplayFiles:
     """Keeps files beside a replay buffer from which it can be filled again.
 
     Args:
@@ -47,103 +66,67 @@ class BufferFiles:
         self._folder, self._buffer = folder, buffer
         self._segments: list[Segment] = []
 
-    def extend(self) -> dict[str, FileDigest]:
-        """Writes what the buffer was given since the last call.
+    @property
+    def names(self) -> set[str]:
+        """Names of the files that the latest state needs."""
+        return {segment.name for segment in self._segments}
 
-        Returns:
-            The files that hold all that is in the buffer now, in order.
+    def state_dict(self) -> State:
+        """Writes what the buffer was given since the last call, and names the files that hold all that is in it now.
+
+        Raises:
+            WriteError: If the disk does not take it.
         """
         buffer = self._buffer
-        oldest = buffer.added - len(buffer)
-        first = max(self._segments[-1].end if self._segments else 0, oldest)
+        # What the ring has overwritten since then needs no file any more.
+        first = max(self._segments[-1].end if self._segments else 0, buffer.oldest)
         if first < buffer.added:
-            data = save_arrays(_transitions(buffer, first, buffer.added))
+            data = save_arrays(buffer.transitions(first, buffer.added))
             segment = Segment(first, buffer.added, FileDigest.of(data))
+            # On the disk before the checkpoint that names it: a checkpoint must never point at what is not there.
             write_bytes(self._folder / segment.name, data)
             self._segments.append(segment)
-        self._segments = [segment for segment in self._segments if segment.end > oldest]
-        return {segment.name: segment.mark for segment in self._segments}
+        self._segments = [segment for segment in self._segments if segment.end > buffer.oldest]
+        segments = {segment.name: segment.digest.to_json() for segment in self._segments}
+        return {"added": buffer.added, "segments": segments}
 
-    def load(self, files: Mapping[str, FileDigest], added: int, ended: int, newest: np.ndarray | None) -> None:
-        """Fills the buffer.
-
-        Args:
-            files: As :meth:`extend` gave them.
-            added: Transitions that had been added to the buffer.
-            ended: Episodes that had ended in it.
-            newest: The observation that the next transition begins with, unless it begins an episode.
+    def load_state_dict(self, state: State) -> None:
+        """Fills the buffer from the files.
 
         Raises:
             DamagedError: If a file is not as it was written, or if they do not hold all that the buffer had.
         """
-        buffer = self._buffer
-        segments = [_segment(name, mark) for name, mark in files.items()]
-        expected = added
-        for segment in reversed(segments):
-            if segment.end != expected or segment.first >= segment.end:
+        digests = {name: FileDigest.from_json(entry) for name, entry in state["segments"].items()}
+        segments = [Segment.named(name, digest) for name, digest in digests.items()]
+        # All names are looked at before the first file is read: it may be gigabytes until one that does not fit.
+        followed_by = [*(segment.first for segment in segments[1:]), state["added"]]
+        for segment, expected in zip(segments, followed_by, strict=False):
+            if segment.end != expected:
                 raise DamagedError(f"{self._folder / segment.name}: not a part of this run's replay buffer")
-            expected = segment.first
-        if expected > max(0, added - buffer.capacity):
-            raise DamagedError(f"{self._folder}: a part of the replay buffer is missing")
-        buffer.added, buffer.ended = added, ended
-        for segment in reversed(segments):
-            ended = self._read(segment, added, ended)
-        if not 0 <= ended <= expected:
-            raise DamagedError(f"{self._folder}: the replay buffer has other episodes than were counted")
-        if newest is not None:
-            buffer.rows[added % len(buffer.rows), : buffer.observation_dim] = newest
+        try:
+            self._buffer.replace(segments[0].first if segments else state["added"], self._read(segments))
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
+            raise DamagedError(f"{self._folder}: not this run's replay buffer ({error})") from error
         self._segments = segments
 
-    def _read(self, segment: Segment, added: int, ended: int) -> int:
-        """Puts a segment, after which ``ended`` episodes had ended, into the buffer; returns how many had before."""
-        path, buffer = self._folder / segment.name, self._buffer
-        count = segment.end - segment.first
-        if count > buffer.capacity or segment.mark.size > count * _bytes_per_transition(buffer) + _HEADER_BYTES:
-            raise DamagedError(f"{path}: larger than this run's replay buffer")
-        try:
-            arrays = load_arrays(read_marked(path, segment.mark, whole=True))
-            endings = arrays["ended"].astype(bool)
-            before = ended - int(endings.sum())
-            kept = np.arange(segment.first, segment.end) >= added - buffer.capacity
-            rows = np.arange(segment.first, segment.end)[kept] % len(buffer.rows)
-            for name in ("rows", "rewards", "terminated"):
-                getattr(buffer, name)[rows] = arrays[name][kept]
-            episodes = np.where(endings, before + np.cumsum(endings) - 1, -1)
-            buffer.endings[rows] = np.where(endings, episodes % buffer.capacity, -1)[kept]
-            last = episodes[endings & kept] % buffer.capacity
-            buffer.last_observations[last] = arrays["last_observations"][kept[endings]]
-        except (SafetensorError, KeyError, ValueError, IndexError, TypeError) as error:
-            raise DamagedError(f"{path}: not a part of this run's replay buffer") from error
-        return before
+    def _read(self, segments: list[Segment]) -> Iterator[dict[str, np.ndarray]]:
+        # One at a time, so that at most one segment is in memory beside the buffer itself.
+        for segment in segments:
+            path, count = self._folder / segment.name, segment.end - segment.first
+            # Refused by its size alone, before a byte of it is read.
+            most = (count + 1) * self._buffer.bytes_per_transition + _HEADER_BYTES
+            if count > self._buffer.capacity or segment.digest.size > most:
+                raise DamagedError(f"{path}: larger than this run's replay buffer")
+            try:
+                arrays = load_arrays(read_checked(path, segment.digest, whole=True))
+            except SafetensorError as error:
+                raise DamagedError(f"{path}: not a safetensors file") from error
+            if len(arrays["ended"]) != count:
+                raise DamagedError(f"{path}: not the transitions of its name")
+            yield arrays
 
 
 def replay_bytes(capacity: int, steps: int, observation_dim: int, action_dim: int) -> int:
     """Bytes on disk of the replay buffer of a run of so many steps, with episodes of 20 steps and more."""
     transition = 4 * (observation_dim + action_dim + 2) + 1
     return int(min(capacity, steps) * (transition + 4 * observation_dim / 20))
-
-
-def _bytes_per_transition(buffer: ReplayBuffer) -> int:
-    # At most each transition ends an episode.
-    return 4 * (buffer.rows.shape[1] + buffer.observation_dim + 2) + 1
-
-
-def _transitions(buffer: ReplayBuffer, first: int, end: int) -> dict[str, np.ndarray]:
-    rows = np.arange(first, end) % len(buffer.rows)
-    # A slice is not copied; only where the ring begins anew must the rows be gathered.
-    where = slice(rows[0], rows[-1] + 1) if rows[0] <= rows[-1] else rows
-    endings = buffer.endings[where]
-    return {
-        "rows": buffer.rows[where],
-        "rewards": buffer.rewards[where],
-        "terminated": buffer.terminated[where],
-        "ended": (endings >= 0).astype(np.uint8),
-        "last_observations": buffer.last_observations[endings[endings >= 0]],
-    }
-
-
-def _segment(name: str, mark: FileDigest) -> Segment:
-    match = _NAME.fullmatch(name)
-    if not match:
-        raise DamagedError(f"{name}: not a part of a replay buffer")
-    return Segment(int(match[1]), int(match[2]), mark)

@@ -11,6 +11,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 
+from acmr.stateful import State
+
 _KINDS = [
     mujoco.mjtWarning(number).name.removeprefix("mjWARN_").lower() for number in range(mujoco.mjtWarning.mjNWARNING)
 ]
@@ -37,6 +39,16 @@ class PhysicsWarnings(gym.Wrapper[Any, Any, Any, Any]):
             self.counts.update({_KINDS[kind]: int(numbers[kind]) for kind in np.flatnonzero(numbers)})
             numbers[:] = 0
         return result
+
+    def state_dict(self) -> State:
+        """What was counted so far."""
+        return {"counts": dict(self.counts)}
+
+    def load_state_dict(self, state: State) -> None:
+        """Counts on from there."""
+        # Others hold the counter itself.
+        self.counts.clear()
+        self.counts.update(state["counts"])
 
 
 @contextmanager

@@ -1,14 +1,14 @@
-"""The state of an environment, captured so that it goes on bit for bit, and a rehearsal that shows whether it does.
+"""Captures and restores the state of an environment so that it goes on bit for bit, and checks whether it does.
 
-After ``mj_step`` the positions of bodies lag behind the joints, and some rewards read them before the next step. So
-MuJoCo's own ``mjSTATE_INTEGRATION`` is not enough: every array that lies in ``MjData`` itself is kept beside it.
-Contacts and constraint forces are not; each step makes them anew.
+A Gymnasium environment is a robot within wrappers, here called its layers. A layer with ``state_dict`` and
+``load_state_dict`` speaks for itself; Gymnasium's own have neither, so what is known of them is written here.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -17,73 +17,135 @@ import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.wrappers import TimeLimit
 
-from acmr.envs.physics import PhysicsWarnings
 from acmr.envs.wrappers import PartialEnv
+from acmr.stateful import State, Stateful
 
 ANYTIME, BETWEEN_EPISODES, NEVER = "anytime", "between episodes", "never"
-#: Steps of a rehearsal before the state is captured, and after it.
+#: Steps of a check before the state is captured, and after it.
 _BEFORE, _AFTER = 25, 25
 _INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
+#: Wrappers that remember nothing from one step to the next.
+_STATELESS = (PartialEnv,)
 
 Env = gym.Env[Any, Any]
 
 
-@dataclass(frozen=True)
-class EnvState:
-    """An environment's state: numbers and text as JSON holds them, and arrays."""
-
-    values: dict[str, Any]
-    arrays: dict[str, np.ndarray] = field(default_factory=dict)
-
-
-def capture(env: Env, within_episode: bool) -> EnvState:
-    """Copies the state.
+class RestorableEnv(gym.Wrapper[Any, Any, Any, Any]):
+    """An environment with a state: at any step where every layer's is known, otherwise between two episodes.
 
     Args:
         env: As :func:`acmr.envs.make_env` makes it.
-        within_episode: Whether the episode goes on; otherwise only what outlives a reset is kept.
     """
-    bare = env.unwrapped
-    values: dict[str, Any] = {"random": bare.np_random.bit_generator.state}
-    if not within_episode:
-        return EnvState(values)
-    values["elapsed_steps"] = [limit._elapsed_steps for limit in _time_limits(env)]
-    values["attributes"] = {name: value for name, value in vars(bare).items() if isinstance(value, bool | int | float)}
-    arrays = {f"attribute.{name}": value.copy() for name, value in vars(bare).items() if _is_numeric(value)}
-    assert isinstance(bare, MujocoEnv)
-    integration = np.empty(mujoco.mj_stateSize(bare.model, _INTEGRATION))
-    mujoco.mj_getState(bare.model, bare.data, integration, _INTEGRATION)
-    arrays["integration"] = integration
-    arrays |= {f"data.{name}": getattr(bare.data, name).copy() for name in data_arrays(bare.model)}
-    return EnvState(values, arrays)
+
+    def __init__(self, env: Env) -> None:
+        super().__init__(env)
+        self._in_episode = False
+
+    def reset(self, **kwargs: Any) -> Any:
+        """Resets, and notes that an episode has begun."""
+        self._in_episode = True
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        """Steps, and notes whether the episode has ended."""
+        result = self.env.step(action)
+        self._in_episode = not (result[2] or result[3])
+        return result
+
+    def state_dict(self) -> State:
+        """Its state; between two episodes only what outlives a reset."""
+        return capture(self.env, self._in_episode)
+
+    def load_state_dict(self, state: State) -> None:
+        """Goes on from there; between two episodes it is to be reset next."""
+        restore(self.env, state)
+        self._in_episode = state["in_episode"]
 
 
-def restore(env: Env, state: EnvState) -> None:
-    """Puts a fresh environment into a captured state. One captured between episodes is to be reset next.
+def capture(env: Env, in_episode: bool) -> State:
+    """The state of an environment.
+
+    Args:
+        env: As :func:`acmr.envs.make_env` makes it.
+        in_episode: Whether an episode is under way; otherwise only what outlives a reset is captured.
+    """
+    layers, bare = _layers(env), env.unwrapped
+    state: State = {"in_episode": in_episode, "random": bare.np_random.bit_generator.state}
+    # Between two episodes, too: only the layer itself knows what of it outlives a reset.
+    state["layers"] = {name: layer.state_dict() for name, layer in layers.items() if isinstance(layer, Stateful)}
+    if in_episode:
+        state["elapsed_steps"] = {name: limit._elapsed_steps for name, limit in _time_limits(layers)}
+        if isinstance(bare, MujocoEnv):
+            state["robot"] = _capture_robot(bare)
+    return state
+
+
+def restore(env: Env, state: State) -> None:
+    """Puts a fresh environment into a captured state. One captured between two episodes is to be reset next.
 
     Raises:
         KeyError: If a part is missing.
         ValueError: If a part does not fit.
     """
-    bare = env.unwrapped
-    within_episode = "elapsed_steps" in state.values
-    if within_episode:
+    layers, bare, in_episode = _layers(env), env.unwrapped, state["in_episode"]
+    if in_episode:
+        # Layers make some of their variables in their first reset; what it sets is overwritten below.
         env.reset()
-    bare.np_random.bit_generator.state = state.values["random"]
-    if not within_episode:
-        return
-    for limit, elapsed in zip(_time_limits(env), state.values["elapsed_steps"], strict=True):
-        limit._elapsed_steps = elapsed
-    for name, value in vars(bare).items():
-        if isinstance(value, bool | int | float):
-            vars(bare)[name] = state.values["attributes"][name]
+    bare.np_random.bit_generator.state = state["random"]
+    for name, layer in layers.items():
+        if isinstance(layer, Stateful):
+            layer.load_state_dict(state["layers"][name])
+    if in_episode:
+        for name, limit in _time_limits(layers):
+            limit._elapsed_steps = state["elapsed_steps"][name]
+        if isinstance(bare, MujocoEnv):
+            _restore_robot(bare, state["robot"])
+
+
+def _layers(env: Env) -> dict[str, Env]:
+    """The wrappers from the outermost, then the environment itself, each under a name of its own."""
+    found = [env]
+    while isinstance(found[-1], gym.Wrapper):
+        found.append(found[-1].env)
+    return {f"{depth}_{type(layer).__name__}": layer for depth, layer in enumerate(found)}
+
+
+def _time_limits(layers: Mapping[str, Env]) -> list[tuple[str, TimeLimit]]:
+    return [(name, layer) for name, layer in layers.items() if isinstance(layer, TimeLimit)]
+
+
+def _capture_robot(robot: MujocoEnv) -> State:
+    """The state of a MuJoCo robot: its own numbers, and the simulation's.
+
+    After ``mj_step`` the positions of bodies lag behind the joints, and some rewards read them before the next step.
+    So MuJoCo's own ``mjSTATE_INTEGRATION`` is not enough: it gives the right observations and, at the first step, wrong
+    rewards. Nor would ``mj_forward`` help, since it computes the positions that a run which was never interrupted does
+    not have yet. So every array of ``MjData`` itself is kept. Contacts and constraint forces, which lie in its arena,
+    are not: each step makes them anew.
+    """
+    integration = np.empty(mujoco.mj_stateSize(robot.model, _INTEGRATION))
+    mujoco.mj_getState(robot.model, robot.data, integration, _INTEGRATION)
+    return {
+        "numbers": {name: value for name, value in vars(robot).items() if type(value) in (bool, int, float)},
+        "arrays": {name: np.array(value) for name, value in vars(robot).items() if _is_numeric(value)},
+        "integration": integration,
+        "data": {name: getattr(robot.data, name).copy() for name in data_arrays(robot.model)},
+    }
+
+
+def _restore_robot(robot: MujocoEnv, state: State) -> None:
+    for name, value in vars(robot).items():
+        if type(value) in (bool, int, float):
+            vars(robot)[name] = state["numbers"][name]
         elif _is_numeric(value):
-            vars(bare)[name] = _like(value, state.arrays[f"attribute.{name}"]).copy()
-    assert isinstance(bare, MujocoEnv)
-    mujoco.mj_setState(bare.model, bare.data, state.arrays["integration"], _INTEGRATION)
-    for name in data_arrays(bare.model):
-        array = getattr(bare.data, name)
-        array[...] = _like(array, state.arrays[f"data.{name}"])
+            stored = _like(value, state["arrays"][name])
+            # A NumPy number must not come back as an array, nor as Python's: they round differently beside float32.
+            vars(robot)[name] = stored[()] if isinstance(value, np.generic) else stored
+    mujoco.mj_setState(robot.model, robot.data, state["integration"], _INTEGRATION)
+    # After it, since it sets some of these arrays as well.
+    for name in data_arrays(robot.model):
+        array = getattr(robot.data, name)
+        array[...] = _like(array, state["data"][name])
 
 
 def data_arrays(model: mujoco.MjModel) -> list[str]:
@@ -123,8 +185,10 @@ def rehearse(make: Callable[[], Env]) -> ResumeCheck:
     actions = rng.uniform(space.low, space.high, (_BEFORE + 2 * _AFTER, *space.low.shape)).astype(np.float32)
     try:
         opening = _play(first, actions[:_BEFORE], reset={"seed": 7})
-        within = _is_captured(first, make, actions[_BEFORE:-_AFTER]) if knows_all_parts(first) else (False, b"")
-        between = _is_captured_between(first, make, actions[-_AFTER:])
+        within = _goes_on(first, make, actions[_BEFORE:-_AFTER], None) if knows_all_layers(first) else (False, b"")
+        # What does not draw with NumPy has no state of its random numbers that could be stored.
+        is_numpy = isinstance(first.unwrapped.np_random, np.random.Generator)
+        between = _goes_on(first, make, actions[-_AFTER:], {}) if is_numpy else (False, b"")
     finally:
         first.close()
     # The state within an episode is of use only where the next episode follows exactly as well.
@@ -132,50 +196,36 @@ def rehearse(make: Callable[[], Env]) -> ResumeCheck:
     return ResumeCheck(when, opening + within[1] + between[1])
 
 
-def knows_all_parts(env: Env) -> bool:
-    """Whether an environment is a MuJoCo robot of Gymnasium's kind within wrappers whose state is known."""
-    while isinstance(env, gym.Wrapper):
-        if type(env) not in (TimeLimit, PartialEnv, PhysicsWarnings):
-            return False
-        env = env.env
-    return isinstance(env, MujocoEnv)
+def knows_all_layers(env: Env) -> bool:
+    """Whether the state of every layer can be captured at any step."""
+    *wrappers, bare = _layers(env).values()
+    known = all(isinstance(layer, Stateful) or type(layer) in (TimeLimit, *_STATELESS) for layer in wrappers)
+    return known and isinstance(bare, MujocoEnv | Stateful)
 
 
-def _is_captured(env: Env, make: Callable[[], Env], actions: np.ndarray) -> tuple[bool, bytes]:
-    state = capture(env, within_episode=True)
-    going_on = _play(env, actions)
-    return _follows(make, state, actions, None, going_on), going_on
-
-
-def _is_captured_between(env: Env, make: Callable[[], Env], actions: np.ndarray) -> tuple[bool, bytes]:
-    try:
-        state = capture(env, within_episode=False)
-        going_on = _play(env, actions, reset={})
-        return _follows(make, state, actions, {}, going_on), going_on
-    except (AttributeError, TypeError, KeyError, ValueError):
-        # Its random numbers are not NumPy's: nothing that could be stored.
-        return False, b""
-
-
-def _follows(
-    make: Callable[[], Env], state: EnvState, actions: np.ndarray, reset: Mapping[str, Any] | None, expected: bytes
-) -> bool:
+def _goes_on(
+    env: Env, make: Callable[[], Env], actions: np.ndarray, reset: Mapping[str, Any] | None
+) -> tuple[bool, bytes]:
+    """Whether a second instance does the same from here on, and what it should do; ``reset`` begins an episode."""
+    # A copy, as a file would hold it: a state may share memory with the environment that goes on first.
+    state = copy.deepcopy(capture(env, in_episode=reset is None))
+    expected = _play(env, actions, reset)
     second = make()
     try:
         restore(second, state)
-        return _play(second, actions, reset) == expected
+        return _play(second, actions, reset) == expected, expected
     finally:
         second.close()
 
 
-def _like(array: np.ndarray, stored: np.ndarray) -> np.ndarray:
+def _like(array: np.ndarray | np.generic, stored: np.ndarray) -> np.ndarray:
     if (stored.shape, stored.dtype) != (array.shape, array.dtype):
         raise ValueError(f"{stored.shape} {stored.dtype} stored, {array.shape} {array.dtype} expected")
     return stored
 
 
 def _is_numeric(value: object) -> bool:
-    return isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+    return isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf"
 
 
 def _play(env: Env, actions: np.ndarray, reset: Mapping[str, Any] | None = None) -> bytes:
@@ -190,12 +240,3 @@ def _play(env: Env, actions: np.ndarray, reset: Mapping[str, Any] | None = None)
         if terminated or truncated:
             trace.append(np.asarray(env.reset()[0]).tobytes())
     return b"".join(trace)
-
-
-def _time_limits(env: Env) -> list[TimeLimit]:
-    found = []
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, TimeLimit):
-            found.append(env)
-        env = env.env
-    return found

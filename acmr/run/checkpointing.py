@@ -16,8 +16,7 @@ from acmr.run.reproducibility import differences
 from acmr.run.run_state import RunState
 from acmr.run.stop_signals import Stopped, StopSignals
 from acmr.run.trainer import is_finite
-from acmr.storage.checkpoint_store import KEPT, SnapshotStore
-from acmr.storage.durable import FileDigest
+from acmr.storage.checkpoint_store import KEPT, FormatError, Snapshot, SnapshotStore
 from acmr.tracking.observer import Observer
 
 #: Steps between two checkpoints where none are set: a share of the run, within these bounds.
@@ -56,15 +55,16 @@ class Checkpoints:
     Args:
         store: Where to.
         state: The parts of the run.
-        conditions: What they must agree on.
+        key: What a checkpoint must agree on with it.
 
     Attributes:
         inexact: For each time that the run went on although something differed: the step, and what.
     """
 
-    def __init__(self, store: SnapshotStore, state: RunState, conditions: CheckpointKey) -> None:
-        self._store, self._state, self._conditions = store, state, conditions
-        self._files: dict[int, Mapping[str, FileDigest]] = {}
+    def __init__(self, store: SnapshotStore, state: RunState, key: CheckpointKey) -> None:
+        self._store, self._state, self._key = store, state, key
+        # Files that the kept checkpoints need beside their own two, by step.
+        self._files: dict[int, set[str]] = {}
         self.inexact: list[dict[str, Any]] = []
 
     def load(self, warn: Callable[[str], None]) -> int | None:
@@ -79,7 +79,7 @@ class Checkpoints:
         Raises:
             ConfigError: If there are some and none can be used; nothing has been changed then.
         """
-        problems = []
+        problems: list[DamagedError] = []
         try:
             steps = self._store.steps()
         except DamagedError as error:
@@ -88,19 +88,29 @@ class Checkpoints:
             try:
                 self._take_up(step)
             except DamagedError as error:
-                problems.append(f"{error}" if str(self._store.folder) in str(error) else f"{self._file(step)}: {error}")
+                problems.append(error)
                 continue
-            for problem in problems:
-                warn(f"warning: {problem}; going on from the checkpoint before, of step {step:,}")
+            for problem, damaged in zip(problems, steps, strict=False):
+                warn(f"warning: {self._about(damaged, problem)}; going on from the checkpoint before, of step {step:,}")
             for later in [later for later in steps if later > step]:
                 self._store.discard(later)
             return step
         if steps:
             raise ConfigError(
-                f"no checkpoint can be used ({'; '.join(problems)}); to start from the first step again, type: "
-                f"{self._conditions.command()} force=true"
+                f"{self._refusal(steps, problems)}; to start from the first step again, type: "
+                f"{self._key.command()} force=true"
             )
         return None
+
+    def _refusal(self, steps: list[int], problems: list[DamagedError]) -> str:
+        if all(isinstance(problem, FormatError) for problem in problems):
+            # Of one run, so that the latest speaks for both.
+            return f"a checkpoint of another version of this program, which can finish this run: {problems[0]}"
+        listed = "; ".join(self._about(step, problem) for step, problem in zip(steps, problems, strict=True))
+        return f"no checkpoint can be used ({listed})"
+
+    def _about(self, step: int, problem: DamagedError) -> str:
+        return f"{problem}" if str(self._store.folder) in str(problem) else f"{self._file(step)}: {problem}"
 
     def save(self) -> bool:
         """Makes a checkpoint, unless the learner's numbers are no longer finite; the trainer will see that itself."""
@@ -110,13 +120,13 @@ class Checkpoints:
             self._store.prepare()
         step, snapshot = self._state.trainer.global_step, self._state.capture()
         about = {
-            "run": self._conditions.digest,
-            "fingerprint": self._conditions.fingerprint,
+            "run": self._key.digest,
+            "fingerprint": self._key.fingerprint,
             "inexact": self.inexact,
             "state": snapshot.values,
         }
-        self._store.write(step, snapshot.with_values(about))
-        self._files[step] = snapshot.files
+        self._store.write(step, Snapshot(about, snapshot.arrays))
+        self._files[step] = self._state.replay.names
         self._files = dict(sorted(self._files.items())[-KEPT:])
         self._store.prune(self._files)
         return True
@@ -137,20 +147,20 @@ class Checkpoints:
             inexact, state = list(snapshot.values["inexact"]), dict(snapshot.values["state"])
         except (KeyError, TypeError, ValueError) as error:
             raise DamagedError("not a checkpoint of this program") from error
-        if run != self._conditions.digest:
+        if run != self._key.digest:
             raise ConfigError(
                 f"{self._file(step)}: a checkpoint of another run (other settings, or a teacher that was trained "
-                f"again since); to start anew, type: {self._conditions.command()} force=true"
+                f"again since); to start anew, type: {self._key.command()} force=true"
             )
-        differing = differences(fingerprint, self._conditions.fingerprint)
-        if differing and self._conditions.mode != INEXACT:
+        differing = differences(fingerprint, self._key.fingerprint)
+        if differing and self._key.mode != INEXACT:
             raise ConfigError(
                 f"{self._file(step)}: made under other conditions: {', '.join(differing)}; the run would not be the "
                 "one it began as. Go on where it was made, or type resume=inexact to go on here (its summary will "
                 "say so), or force=true to start anew"
             )
-        self._state.restore(snapshot.with_values(state))
-        self._files = {step: snapshot.files}
+        self._state.restore(Snapshot(state, snapshot.arrays))
+        self._files = {step: self._state.replay.names}
         self.inexact = [*inexact, *([{"step": step, "differing": differing}] if differing else [])]
 
     def _file(self, step: int) -> str:

@@ -11,11 +11,11 @@ import torch
 
 from acmr.agent.precision import MatmulPrecision, choose_products
 from acmr.agent.replay_buffer import ReplayBuffer
-from acmr.agent.replay_files import BufferFiles
+from acmr.agent.replay_files import ReplayFiles
 from acmr.config import THRESHOLD, flatten, is_neutral, schema_defaults
 from acmr.envs import make_env
 from acmr.envs.physics import PhysicsWarnings, no_log_file
-from acmr.envs.state import ANYTIME, NEVER, ResumeCheck, rehearse
+from acmr.envs.state import ANYTIME, NEVER, RestorableEnv, ResumeCheck, rehearse
 from acmr.records import DIVERGED, EpisodeInProgress
 from acmr.run.checkpointing import CheckpointKey, Checkpoints, CheckpointSchedule
 from acmr.run.preparation import Prepared, arrays_bytes, check_space, prepare
@@ -120,9 +120,10 @@ class Session:
         """Makes the parts of the run as they are before its first step; touches no disk."""
         prepared, config, folder = self.prepared, self.prepared.spec.config, self.run_dir.checkpoint_folder
         dims, streams, about = prepared.networks.dims, prepared.streams, prepared.about
-        env, logs = PhysicsWarnings(make_env(config.env)), RunLogs(self.run_dir, about)
+        env, logs = RestorableEnv(make_env(config.env)), RunLogs(self.run_dir, about)
+        warnings = PhysicsWarnings(env)
         trainer = Trainer(
-            env=env,
+            env=warnings,
             agent=prepared.learner(
                 prepared.networks, config.agent, streams.acting, streams.learning, prepared.log_alpha, config.device
             ),
@@ -133,7 +134,7 @@ class Session:
             episode=EpisodeInProgress(about.reward_terms, about.has_forward_velocity),
             is_satisfied=lambda: config.stop == THRESHOLD and logs.meet(config.threshold, config.consecutive),
         )
-        state = RunState(trainer, env.counts, logs, BufferFiles(folder, trainer.buffer))
+        state = RunState(trainer, env, warnings, ReplayFiles(folder, trainer.buffer), logs)
         store = SnapshotStore(folder, arrays_bytes(prepared.networks))
         return state, Checkpoints(store, state, self._conditions())
 
@@ -166,13 +167,13 @@ class Session:
         watchers = make_watchers(spec, trainer.global_step, self.say)
         trainer.observers = [state.logs, *watchers, schedule]
         try:
-            state.start_clock()
+            state.clock.start()
             summary = self._summary(checkpoints, state, _train(trainer))
             if summary["status"] != DIVERGED:
                 description = describe_teacher(spec, self.prepared.about, trainer.agent, summary)
                 save_teacher(run_dir.path, trainer.agent.networks, description)
             # Every row is on the disk before anything says that the run is finished, and a run with a summary is.
-            state.logs.marks()
+            state.logs.sync()
             run_dir.write_json(run_dir.summary_file, summary)
         except BaseException:
             # What ended the run matters more than what closing may raise.
@@ -203,11 +204,11 @@ class Session:
     ) -> dict[str, Any]:
         more = {
             "matrix_products": asdict(self.products),
-            "physics_warnings": dict(state.warnings),
+            "physics_warnings": dict(state.warnings.counts),
             "inexact_resumes": checkpoints.inexact,
         }
         steps, history = state.trainer.global_step, state.logs.history
-        return summarize(self.prepared.spec, history, steps, state.seconds, diverged) | more
+        return summarize(self.prepared.spec, history, steps, state.clock.seconds, diverged) | more
 
     def _conditions(self) -> CheckpointKey:
         spec, report, usual = self.prepared.spec, asdict(self.prepared.report), schema_defaults()

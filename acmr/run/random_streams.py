@@ -11,6 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from acmr.stateful import State
+
+#: Streams that nothing else keeps the state of.
+_DRAWN_BY_THE_RUN = ("replay", "exploration")
+
 
 @dataclass(frozen=True)
 class RandomStreams:
@@ -31,6 +36,19 @@ class RandomStreams:
     replay: np.random.Generator
     exploration: np.random.Generator
     environment: int
+
+    def state_dict(self) -> State:
+        """Where the streams are that the run draws from as it goes on.
+
+        Those of the networks and of the first reset are used before the first step only, and the learner, which is
+        given the other two, has them in its own state.
+        """
+        return {name: getattr(self, name).bit_generator.state for name in _DRAWN_BY_THE_RUN}
+
+    def load_state_dict(self, state: State) -> None:
+        """Goes on drawing from there."""
+        for name in _DRAWN_BY_THE_RUN:
+            getattr(self, name).bit_generator.state = state[name]
 
 
 def random_streams(seed: int, device: str = "cpu") -> RandomStreams:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,9 @@ from acmr.records import (
     EpisodeRecord,
     meets_threshold,
 )
+from acmr.stateful import State
 from acmr.storage.csv_log import CsvLog
-from acmr.storage.durable import FileDigest
+from acmr.storage.durable import FileDigest, read_checked
 from acmr.storage.run_dir import RunDir
 from acmr.tracking.observer import Observer
 
@@ -47,14 +48,21 @@ class RunLogs(Observer):
         """Begins both files anew."""
         self._open({})
 
-    def go_on(self, marks: Mapping[str, FileDigest]) -> None:
-        """Cuts both files back to what they were, and reads the episodes.
+    def state_dict(self) -> State:
+        """The size and hash of each file, all of whose rows are on the disk then."""
+        return {name: digest.to_json() for name, digest in self.sync().items()}
+
+    def load_state_dict(self, state: State) -> None:
+        """Cuts both files back to what they held, and reads the episodes.
 
         Raises:
-            DamagedError: If one does not begin with what was marked.
-            KeyError: If a mark is missing.
+            DamagedError: If one does not begin with that; neither has been changed then.
         """
-        self._open({name: marks[name] for name in ("episodes", "metrics")})
+        digests = {name: FileDigest.from_json(state[name]) for name in self._files()}
+        # Looked at before either is cut back: a checkpoint that is refused must leave both as they are.
+        for name, (path, _) in self._files().items():
+            read_checked(path, digests[name])
+        self._open(digests)
         self.history = self._read_episodes(self._run_dir.episodes_file)
 
     def on_episode(self, record: EpisodeRecord) -> None:
@@ -74,9 +82,9 @@ class RunLogs(Observer):
         latest = [record.episodic_return for record in self.history[-consecutive:]]
         return meets_threshold(latest, threshold, consecutive)
 
-    def marks(self) -> dict[str, FileDigest]:
+    def sync(self) -> dict[str, FileDigest]:
         """Waits until every row is on the disk, and says what each file holds."""
-        return {name: log.mark() for name, log in self._logs.items()}
+        return {name: log.sync() for name, log in self._logs.items()}
 
     def close(self, summary: Mapping[str, Any] | None = None) -> None:
         """Closes both files; where they are closed already, does nothing."""
@@ -84,14 +92,16 @@ class RunLogs(Observer):
         for log in logs.values():
             log.close()
 
-    def _open(self, marks: Mapping[str, FileDigest]) -> None:
-        self.close()
-        files = {
+    def _files(self) -> dict[str, tuple[Path, Sequence[str]]]:
+        return {
             "episodes": (self._run_dir.episodes_file, self._columns),
             "metrics": (self._run_dir.metrics_file, _METRIC_COLUMNS),
         }
-        for name, (path, columns) in files.items():
-            self._logs[name] = CsvLog(path, columns, marks.get(name))
+
+    def _open(self, digests: Mapping[str, FileDigest]) -> None:
+        self.close()
+        for name, (path, columns) in self._files().items():
+            self._logs[name] = CsvLog(path, columns, digests.get(name))
 
     def _read_episodes(self, path: Path) -> list[EpisodeRecord]:
         with path.open(newline="", encoding="utf-8") as stream:

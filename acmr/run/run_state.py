@@ -1,84 +1,101 @@
-"""Everything that the rest of a run depends on, taken from its parts and put back into them.
+"""Captures and restores the complete state of a run: the parts that have one, by name.
 
-``tests/test_resume_fields.py`` leaves out each entry in turn and expects another run.
+A new part with a state is one more line in :meth:`RunState.parts`. ``tests/test_resume_fields.py`` leaves out each
+entry of a checkpoint in turn and expects another run.
 """
 
 from __future__ import annotations
 
+import copy
 import time
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
+from urllib.parse import quote, unquote
 
 import numpy as np
 import torch
 
-from acmr.agent.replay_files import BufferFiles
-from acmr.envs.state import EnvState, capture, restore
+from acmr.agent.replay_files import ReplayFiles
+from acmr.envs.physics import PhysicsWarnings
+from acmr.envs.state import RestorableEnv
 from acmr.records import DamagedError
 from acmr.run.run_logs import RunLogs
 from acmr.run.trainer import Trainer
+from acmr.stateful import State, Stateful
 from acmr.storage.checkpoint_store import Snapshot
-from acmr.storage.durable import FileDigest
 from acmr.text import one_line
 
-#: What :class:`acmr.records.EpisodeInProgress` sums up.
-_EPISODE = ("length", "total", "distance", "sums")
-#: Parts of :meth:`acmr.agent.sac.SAC.state_dict` that are plain numbers.
-_LEARNER_VALUES = ("metric_sums", "metric_counts")
-_AGENT, _ENVIRONMENT, _OBSERVATION = "agent/", "environment/", "observation"
+#: What arrays are called in a checkpoint, by the library that they come from and go back to.
+_NUMPY, _TORCH = "numpy", "torch"
 
 
-@dataclass
-class RunState:
-    """The parts of a run that have a state.
+class Clock:
+    """The seconds that a run has taken, those of earlier processes included."""
 
-    Attributes:
-        trainer: With the agent, the buffer, the random streams and the environment.
-        warnings: What MuJoCo has warned of.
-        seconds_before: How long the run had taken when this process took it up.
-    """
-
-    trainer: Trainer
-    warnings: Counter[str]
-    logs: RunLogs
-    files: BufferFiles
-    seconds_before: float = 0.0
-    _started: float = field(default_factory=time.perf_counter)
+    def __init__(self) -> None:
+        self._before, self._started = 0.0, time.perf_counter()
 
     @property
     def seconds(self) -> float:
         """How long the run has taken so far."""
-        return self.seconds_before + time.perf_counter() - self._started
+        return self._before + time.perf_counter() - self._started
 
-    def start_clock(self) -> None:
+    def start(self) -> None:
         """Counts the seconds of this process from now on."""
+        # Not from its making on: what a process needs until its first step is no time of training.
         self._started = time.perf_counter()
 
-    def capture(self) -> Snapshot:
-        """Copies the state, and waits until the files that belong to it are on the disk."""
-        trainer = self.trainer
-        agent, streams, observation = trainer.agent.state_dict(), trainer.streams, trainer.observation
-        environment = capture(trainer.env, within_episode=observation is not None)
-        arrays = {f"{_AGENT}{name}": tensor.cpu().numpy() for name, tensor in agent["tensors"].items()}
-        arrays |= {f"{_AGENT}random/{name}": state.numpy() for name, state in agent["generators"].items()}
-        arrays |= {f"{_ENVIRONMENT}{name}": array for name, array in environment.arrays.items()}
-        if observation is not None:
-            arrays[_OBSERVATION] = np.array(observation)
-        values = {
-            "global_step": trainer.global_step,
-            "learner": {name: agent[name] for name in _LEARNER_VALUES},
-            "replay": streams.replay.bit_generator.state,
-            "exploration": streams.exploration.bit_generator.state,
-            "added": trainer.buffer.added,
-            "ended": trainer.buffer.ended,
-            "episode": {name: getattr(trainer.episode, name) for name in _EPISODE},
-            "environment": environment.values,
-            "warnings": dict(self.warnings),
-            "logs": {name: [mark.size, mark.sha256] for name, mark in self.logs.marks().items()},
-            "wall_seconds": self.seconds,
+    def state_dict(self) -> State:
+        """The seconds so far."""
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state: State) -> None:
+        """Counts on from there."""
+        self._before = float(state["seconds"])
+
+
+@dataclass
+class RunState:
+    """The parts of a run.
+
+    Attributes:
+        trainer: With its agent, random streams and the sums of the current episode.
+        environment: What the trainer steps, without the counter around it.
+        warnings: That counter: what MuJoCo has warned of.
+        replay: The trainer's replay buffer, with its files.
+        logs: The run's own CSV files.
+        clock: How long it takes.
+    """
+
+    trainer: Trainer
+    environment: RestorableEnv
+    warnings: PhysicsWarnings
+    replay: ReplayFiles
+    logs: RunLogs
+    clock: Clock = field(default_factory=Clock)
+
+    def parts(self) -> dict[str, Stateful]:
+        """Everything that the rest of the run depends on, by its name in a checkpoint, in the order of restoring."""
+        return {
+            "trainer": self.trainer,
+            "episode": self.trainer.episode,
+            "streams": self.trainer.streams,
+            "agent": self.trainer.agent,
+            "environment": self.environment,
+            "warnings": self.warnings,
+            "replay": self.replay,
+            "clock": self.clock,
+            # Last, since restoring cuts the CSV files back: what is found to be damaged before has changed nothing.
+            "logs": self.logs,
         }
-        return Snapshot(values, arrays, self.files.extend())
+
+    def capture(self) -> Snapshot:
+        """Captures the state, and waits until the files that belong to it are on the disk.
+
+        Raises:
+            TypeError: If a part's state is not made as :data:`acmr.stateful.State` says.
+        """
+        return Snapshot(*split({name: part.state_dict() for name, part in self.parts().items()}))
 
     def restore(self, snapshot: Snapshot) -> None:
         """Puts a state into the parts.
@@ -86,36 +103,62 @@ class RunState:
         Raises:
             DamagedError: If it is not the state of such a run.
         """
+        parts = self.parts()
+        # Whatever a part makes of numbers that are not its own: somebody else's file must not end in a traceback.
         try:
-            self._restore(snapshot.values, snapshot)
+            state = join(snapshot.values, snapshot.arrays)
+            if state.keys() != parts.keys():
+                raise ValueError(f"other parts: {', '.join(sorted(state.keys() ^ parts.keys()))}")
+            for name, part in parts.items():
+                part.load_state_dict(state[name])
         except (KeyError, ValueError, TypeError, IndexError, AttributeError, RuntimeError, OverflowError) as error:
             raise DamagedError(f"not the state of this run ({one_line(error)})") from error
 
-    def _restore(self, values: dict[str, Any], snapshot: Snapshot) -> None:
-        trainer, arrays = self.trainer, snapshot.arrays
-        trainer.global_step = int(values["global_step"])
-        trainer.observation = arrays.get(_OBSERVATION)
-        if trainer.observation is not None and trainer.observation.shape != trainer.env.observation_space.shape:
-            raise ValueError(f"an observation of shape {trainer.observation.shape}")
-        self.files.load(snapshot.files, values["added"], values["ended"], trainer.observation)
-        trainer.agent.load_state_dict(_agent_state(arrays, values["learner"]))
-        trainer.streams.replay.bit_generator.state = values["replay"]
-        trainer.streams.exploration.bit_generator.state = values["exploration"]
-        for name in _EPISODE:
-            setattr(trainer.episode, name, values["episode"][name])
-        restore(trainer.env, EnvState(values["environment"], _part(arrays, _ENVIRONMENT)))
-        self.warnings.clear()
-        self.warnings.update(values["warnings"])
-        self.seconds_before = float(values["wall_seconds"])
-        # Last, since it cuts the files back.
-        self.logs.go_on({name: FileDigest(count, sha256) for name, (count, sha256) in values["logs"].items()})
+
+def split(state: State, path: str = "") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Takes a state apart into what JSON holds and arrays, which are named by their place in it.
+
+    Raises:
+        TypeError: If it holds anything that a file would not give back as it is.
+    """
+    values: dict[str, Any] = {}
+    arrays: dict[str, np.ndarray] = {}
+    for key, leaf in state.items():
+        if type(key) is not str:
+            raise TypeError(f"state{path}: the key {key!r} is no text")
+        # Quoted, for a name may hold the slash that parts names.
+        place = f"{path}/{quote(key, safe='')}"
+        if isinstance(leaf, dict):
+            values[key], inner = split(leaf, place)
+            arrays |= inner
+        elif isinstance(leaf, np.ndarray) and leaf.dtype.kind in "biuf":
+            arrays[_NUMPY + place] = leaf
+        elif isinstance(leaf, torch.Tensor):
+            arrays[_TORCH + place] = leaf.detach().cpu().numpy()
+        elif _is_plain(leaf):
+            values[key] = leaf
+        else:
+            raise TypeError(
+                f"state{place}: a {type(leaf).__name__} cannot be stored; give a number, a text or an array"
+            )
+    return values, arrays
 
 
-def _agent_state(arrays: dict[str, np.ndarray], values: dict[str, Any]) -> dict[str, Any]:
-    parts = {name: torch.from_numpy(array.copy()) for name, array in _part(arrays, _AGENT).items()}
-    generators = {name.removeprefix("random/"): parts.pop(name) for name in list(parts) if name.startswith("random/")}
-    return {"tensors": parts, "generators": generators, **{name: values[name] for name in _LEARNER_VALUES}}
+def join(values: dict[str, Any], arrays: dict[str, np.ndarray]) -> State:
+    """Reverses :func:`split`; every array is a copy."""
+    state = copy.deepcopy(values)
+    for name, array in arrays.items():
+        kind, *groups, last = (unquote(part) for part in name.split("/"))
+        group = state
+        for inner in groups:
+            group = group[inner]
+        if last in group:
+            raise ValueError(f"two values at {name}")
+        # What was read from a file cannot be written to, and parts do write to it.
+        group[last] = torch.from_numpy(array.copy()) if kind == _TORCH else array.copy()
+    return state
 
 
-def _part(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+def _is_plain(leaf: object) -> bool:
+    # The type itself: a NumPy number is a float, too, but would come back as Python's, which rounds differently.
+    return type(leaf) in (type(None), bool, int, float, str) or (type(leaf) is list and all(map(_is_plain, leaf)))

@@ -15,6 +15,7 @@ from acmr.agent.learner import Learner
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.records import EpisodeInProgress
 from acmr.run.random_streams import RandomStreams
+from acmr.stateful import State
 from acmr.tracking.observer import Observer
 
 
@@ -70,6 +71,21 @@ class Trainer:
         """Whether no further step is to be taken."""
         # Asked anew rather than kept: a run that was killed right here must not go on when it is taken up again.
         return self.global_step >= self.total_timesteps or (self.observation is None and self.is_satisfied())
+
+    def state_dict(self) -> State:
+        """How far it is; its agent, environment, buffer, streams and episode have states of their own."""
+        return {"global_step": self.global_step, "observation": self.observation}
+
+    def load_state_dict(self, state: State) -> None:
+        """Goes on from there.
+
+        Raises:
+            ValueError: If the observation is not one of this environment.
+        """
+        observation = state["observation"]
+        if observation is not None and observation.shape != self.env.observation_space.shape:
+            raise ValueError(f"an observation of shape {observation.shape}")
+        self.global_step, self.observation = int(state["global_step"]), observation
 
     def train(self) -> None:
         """Runs from the step that was reached to the last.

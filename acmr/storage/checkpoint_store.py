@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ from acmr.records import DamagedError
 from acmr.storage.durable import (
     FileDigest,
     make_folder,
-    read_marked,
+    read_checked,
     read_regular,
     remove,
     remove_leftovers,
@@ -33,13 +33,18 @@ from acmr.storage.durable import (
     write_bytes,
 )
 
-FORMAT_VERSION = 1
+#: Changes with what a checkpoint holds and where; another one is refused.
+FORMAT_VERSION = 2
 #: Checkpoints that are kept: should the latest be damaged, there is the one before.
 KEPT = 2
 #: A state larger than this is not one of ours.
 _MAX_STATE_BYTES = 64 << 20
 _STATE = re.compile(r"step_(\d{1,15})\.json")
 _OURS = re.compile(r"(step_\d{1,15}\.(json|safetensors)|segment_\d{1,15}_\d{1,15}\.safetensors)")
+
+
+class FormatError(DamagedError):
+    """A checkpoint of another version of this program. The message says which format it has."""
 
 
 @dataclass(frozen=True)
@@ -49,16 +54,10 @@ class Snapshot:
     Attributes:
         values: The state as far as JSON holds it.
         arrays: The rest of it.
-        files: Other files of the checkpoint folder that belong to it, with their marks.
     """
 
     values: dict[str, Any]
     arrays: dict[str, np.ndarray]
-    files: dict[str, FileDigest]
-
-    def with_values(self, values: dict[str, Any]) -> Snapshot:
-        """The same arrays and files with other values."""
-        return Snapshot(values, self.arrays, self.files)
 
 
 class SnapshotStore:
@@ -89,41 +88,39 @@ class SnapshotStore:
         remove_leftovers(self.folder)
 
     def write(self, step: int, snapshot: Snapshot) -> None:
-        """Adds a checkpoint; its other files must be on the disk."""
+        """Adds a checkpoint; other files that its state names must be on the disk."""
         data = save_arrays(snapshot.arrays)
         write_bytes(self._arrays_file(step), data)
-        content = {
-            "values": snapshot.values,
-            "arrays": _as_json(FileDigest.of(data)),
-            "files": {name: _as_json(mark) for name, mark in snapshot.files.items()},
-        }
+        content = {"values": snapshot.values, "arrays": FileDigest.of(data).to_json()}
         body = (json.dumps(content) + "\n").encode()
+        # Last: a checkpoint exists once this file does, and all that it needs is there by then.
         write_bytes(self.state_file(step), _head(body) + b"\n" + body)
 
     def read(self, step: int) -> Snapshot:
-        """Reads a checkpoint; its other files are left to whoever knows what they hold.
+        """Reads a checkpoint; other files that its state names are left to whoever knows what they hold.
 
         Raises:
+            FormatError: If another version of this program wrote it.
             DamagedError: If it is not as it was written, saying which file.
         """
         path = self.state_file(step)
         head, _, body = read_regular(path, _MAX_STATE_BYTES).partition(b"\n")
+        # Before anything is read as JSON: a checksum of our own finds what a parser takes for another value.
         if head != _head(body):
-            raise DamagedError(f"{path}: does not hold what was written to it")
+            raise _not_as_written(path, head)
         try:
             content = json.loads(body)
-            mark = _from_json(content["arrays"])
-            files = {name: _from_json(entry) for name, entry in content["files"].items()}
+            digest = FileDigest.from_json(content["arrays"])
             values = dict(content["values"])
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise DamagedError(f"{path}: not a checkpoint of this program") from error
-        if mark.size > self._limit or not all(_OURS.fullmatch(name) for name in files):
+        if digest.size > self._limit:
             raise DamagedError(f"{path}: not a checkpoint of this run")
         try:
-            arrays = load_arrays(read_marked(self._arrays_file(step), mark, whole=True))
+            arrays = load_arrays(read_checked(self._arrays_file(step), digest, whole=True))
         except (SafetensorError, KeyError, ValueError, TypeError) as error:
             raise DamagedError(f"{self._arrays_file(step)}: not a safetensors file") from error
-        return Snapshot(values, arrays, files)
+        return Snapshot(values, arrays)
 
     def discard(self, step: int) -> None:
         """Removes a checkpoint, so that at every moment it is whole or not there."""
@@ -131,11 +128,11 @@ class SnapshotStore:
         sync_folder(self.folder)
         remove(self._arrays_file(step))
 
-    def prune(self, files: Mapping[int, Mapping[str, FileDigest]]) -> None:
+    def prune(self, files: Mapping[int, Collection[str]]) -> None:
         """Removes all but the latest checkpoints, and whatever belongs to none.
 
         Args:
-            files: The other files of the checkpoints that are to be kept, by step.
+            files: Names of the other files of the checkpoints that are to be kept, by step.
         """
         for step in self.steps():
             if step not in files:
@@ -171,12 +168,9 @@ def _head(body: bytes) -> bytes:
     return json.dumps({"format_version": FORMAT_VERSION, "sha256": hashlib.sha256(body).hexdigest()}).encode()
 
 
-def _as_json(mark: FileDigest) -> list[int | str]:
-    return [mark.size, mark.sha256]
-
-
-def _from_json(entry: Any) -> FileDigest:
-    count, sha256 = entry
-    if not isinstance(count, int) or not isinstance(sha256, str) or count < 0:
-        raise ValueError("no mark")
-    return FileDigest(count, sha256)
+def _not_as_written(path: Path, head: bytes) -> DamagedError:
+    with suppress(ValueError, AttributeError, RecursionError):
+        version = json.loads(head).get("format_version")
+        if isinstance(version, int) and version != FORMAT_VERSION:
+            return FormatError(f"{path}: format {version} (this version reads {FORMAT_VERSION})")
+    return DamagedError(f"{path}: does not hold what was written to it")

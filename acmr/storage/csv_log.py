@@ -16,16 +16,16 @@ class CsvLog:
     Args:
         path: The file.
         columns: Its header.
-        mark: What an earlier process had written of it; None: it is begun anew.
+        digest: What an earlier process had written of it; None: it is begun anew.
 
     Raises:
-        DamagedError: If the file does not begin with what was marked.
+        DamagedError: If the file does not begin with that.
     """
 
-    def __init__(self, path: Path, columns: Sequence[str], mark: FileDigest | None = None) -> None:
+    def __init__(self, path: Path, columns: Sequence[str], digest: FileDigest | None = None) -> None:
         self.columns = tuple(columns)
-        self._file = Appender(path, mark)
-        if mark is None:
+        self._file = Appender(path, digest)
+        if digest is None:
             self.row(self.columns)
 
     def row(self, values: Iterable[object]) -> None:
@@ -34,9 +34,9 @@ class CsvLog:
         csv.writer(line, lineterminator="\n").writerow(values)
         self._file.append(line.getvalue().encode())
 
-    def mark(self) -> FileDigest:
+    def sync(self) -> FileDigest:
         """Waits until every row is on the disk, and says what that is."""
-        return self._file.mark()
+        return self._file.sync()
 
     def close(self) -> None:
         """Closes the file."""

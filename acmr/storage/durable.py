@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from acmr.config import ConfigError
 from acmr.records import DamagedError
@@ -65,8 +66,24 @@ class FileDigest:
 
     @staticmethod
     def of(data: bytes) -> FileDigest:
-        """The mark of a whole content."""
+        """The digest of a whole content."""
         return FileDigest(len(data), hashlib.sha256(data).hexdigest())
+
+    def to_json(self) -> list[int | str]:
+        """As JSON holds it."""
+        return [self.size, self.sha256]
+
+    @staticmethod
+    def from_json(entry: Any) -> FileDigest:
+        """Reverses :meth:`to_json`.
+
+        Raises:
+            ValueError, TypeError: If it is no digest.
+        """
+        size, sha256 = entry
+        if not isinstance(size, int) or not isinstance(sha256, str) or size < 0:
+            raise ValueError("no digest of a file")
+        return FileDigest(size, sha256)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -138,28 +155,28 @@ class Appender:
 
     Args:
         path: The file.
-        mark: What it is to be cut back to; None: it is begun anew.
+        digest: What it is to be cut back to; None: it is begun anew.
 
     Raises:
-        DamagedError: If it does not begin with what was marked; nothing has been changed then.
+        DamagedError: If it does not begin with that; nothing has been changed then.
         WriteError: If it cannot be written.
     """
 
-    def __init__(self, path: Path, mark: FileDigest | None = None) -> None:
+    def __init__(self, path: Path, digest: FileDigest | None = None) -> None:
         self._path = path
-        held = b"" if mark is None else read_marked(path, mark)
+        held = b"" if digest is None else read_checked(path, digest)
         with _step("open", path):
             self._descriptor = os.open(path, _CREATE | os.O_APPEND, 0o644)
             os.ftruncate(self._descriptor, len(held))
         self._hash, self._bytes = hashlib.sha256(held), len(held)
 
     def append(self, data: bytes) -> None:
-        """Appends; it reaches the disk with the next :meth:`mark`."""
+        """Appends; it reaches the disk with the next :meth:`sync`."""
         _write(self._descriptor, self._path, data)
         self._hash.update(data)
         self._bytes += len(data)
 
-    def mark(self) -> FileDigest:
+    def sync(self) -> FileDigest:
         """Waits until everything is on the disk, and says what that is."""
         with _step("sync", self._path):
             os.fsync(self._descriptor)
@@ -170,19 +187,19 @@ class Appender:
         os.close(self._descriptor)
 
 
-def read_marked(path: Path, mark: FileDigest, whole: bool = False) -> bytes:
-    """Reads what a mark was made of.
+def read_checked(path: Path, digest: FileDigest, whole: bool = False) -> bytes:
+    """Reads what a digest was made of.
 
     Args:
         path: The file.
-        mark: Its mark.
+        digest: Its digest.
         whole: Whether the file must hold nothing else.
 
     Raises:
         DamagedError: If the file does not begin with that, or is longer though it should not be.
     """
-    data = read_regular(path, mark.size if whole else None, mark.size)
-    if FileDigest.of(data) != mark:
+    data = read_regular(path, digest.size if whole else None, digest.size)
+    if FileDigest.of(data) != digest:
         raise DamagedError(f"{path}: does not hold what was written to it")
     return data
 
