@@ -154,7 +154,7 @@ def test_a_setting_that_is_added_to_the_schema_voids_no_checkpoint(tmp_path, mon
     def digest(config: ExperimentConfig) -> str:
         run = Run(tmp_path, FULL)
         run.spec = replace(run.spec, config=config)
-        return parts(run)[1]._conditions.digest
+        return parts(run)[1]._key.digest
 
     config = Run(tmp_path, FULL).spec.config
     before = digest(config)
