@@ -22,8 +22,8 @@ import acmr.run.experiment as experiment
 from acmr.agent.precision import MatmulPrecision, choose_products
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.config import ConfigError
-from acmr.envs import make_env
-from acmr.envs.state import ResumeCheck, rehearse
+from acmr.envs import check_resume
+from acmr.envs.state import ResumeCheck
 from acmr.run import reproducibility, summary
 from acmr.run.checkpointing import Checkpoints, CheckpointSchedule
 from acmr.run.preparation import Prepared, prepare
@@ -64,7 +64,7 @@ def found_out(overrides: tuple[str, ...]) -> tuple[Prepared, ResumeCheck, Matmul
     # Whoever edits the program while these tests run does not change it for them.
     reproducibility._program()
     products = choose_products(made.config.agent, made.config.device)
-    return prepare(made), rehearse(lambda: make_env(made.config.env)), products
+    return prepare(made), check_resume(made.config.env), products
 
 
 @dataclass
@@ -131,7 +131,7 @@ class Run:
         # What every process of a run would find out again; no process changes it for another.
         prepared, rehearsal, products = found_out(self.overrides)
         experiment.prepare = lambda made: replace(prepared, spec=made)
-        experiment.rehearse = lambda make: rehearsal
+        experiment.check_resume = lambda env: rehearsal
         summary.git_commit = lambda: "a commit"
         experiment.choose_products = lambda agent, device: products
         try:

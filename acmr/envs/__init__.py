@@ -19,10 +19,11 @@ from gymnasium.spaces import Box
 from acmr.config import EnvConfig
 from acmr.envs.construct import cannot_run, construct
 from acmr.envs.naming import part_names, probe
+from acmr.envs.state import ResumeCheck, rehearse
 from acmr.envs.wrappers import PartialEnv, kept_rows
 from acmr.records import VELOCITY_KEY
 
-__all__ = ["EnvDescription", "describe", "make_env"]
+__all__ = ["EnvDescription", "check_resume", "describe", "make_env"]
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,11 @@ def make_env(config: EnvConfig, render_mode: str | None = None) -> gym.Env[np.nd
     Raises:
         ConfigError: With one line that says what is wrong with the settings.
     """
-    whole = _try_out(config)
-    env = construct(config, render_mode)
+    return _with_kept(config, _try_out(config), construct(config, render_mode))
+
+
+def _with_kept(config: EnvConfig, whole: EnvDescription, env: gym.Env[Any, Any]) -> gym.Env[np.ndarray, np.ndarray]:
+    """Flattens an environment and takes from it what the settings drop."""
     sensors, actuators = _kept(config, whole)
     all_kept = len(sensors) == len(whole.observation_names) and len(actuators) == len(whole.action_names)
     flat = len(env.observation_space.shape or ()) == 1 and len(env.action_space.shape or ()) == 1
@@ -93,20 +97,41 @@ def describe(config: EnvConfig) -> EnvDescription:
     )
 
 
+def check_resume(config: EnvConfig) -> ResumeCheck:
+    """Checks when an environment's state can be stored (:mod:`acmr.envs.state`), with three instances of it.
+
+    One of them is also tried out, so that :func:`describe` and :func:`make_env` need not do that afterwards.
+
+    Raises:
+        ConfigError: As :func:`make_env`.
+    """
+    whole, env = _tried(config)
+    return rehearse(lambda: make_env(config), _with_kept(config, whole, env))
+
+
 def _try_out(config: EnvConfig) -> EnvDescription:
     """Describes the environment with all its sensors and actuators."""
+    key = _key(config)
+    if key not in _tried_out:
+        _tried(config)[1].close()
+    return _tried_out[key]
+
+
+def _tried(config: EnvConfig) -> tuple[EnvDescription, gym.Env[Any, Any]]:
+    """An instance that has been tried out, and what was seen of it."""
+    env = construct(config)
+    try:
+        whole = _tried_out[_key(config)] = _look_at(env)
+    except Exception as error:
+        env.close()
+        raise cannot_run(config, error) from error
+    return whole, env
+
+
+def _key(config: EnvConfig) -> str:
     # Not the name, the teacher and what is dropped: none of them changes what is constructed.
     made_from = (config.id, config.kwargs, config.remove_bodies, config.max_episode_steps)
-    key = json.dumps(made_from, sort_keys=True, default=repr)
-    if key not in _tried_out:
-        env = construct(config)
-        try:
-            _tried_out[key] = _look_at(env)
-        except Exception as error:
-            raise cannot_run(config, error) from error
-        finally:
-            env.close()
-    return _tried_out[key]
+    return json.dumps(made_from, sort_keys=True, default=repr)
 
 
 def _look_at(env: gym.Env[Any, Any]) -> EnvDescription:

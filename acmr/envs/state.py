@@ -173,13 +173,15 @@ class ResumeCheck:
     trace: bytes
 
 
-def rehearse(make: Callable[[], Env]) -> ResumeCheck:
+def rehearse(make: Callable[[], Env], first: Env | None = None) -> ResumeCheck:
     """Captures the state of one instance, puts another into it, and compares what both do next.
 
     Args:
-        make: Makes instances.
+        make: Makes instances. Each state goes into a new one, as that of a resumed run does: what an environment makes
+            in its first step would be there already in one that has been played with.
+        first: The instance whose states are captured; it may have been used, and is closed. None: a new one.
     """
-    first, rng = make(), np.random.default_rng(0)
+    first, rng = first or make(), np.random.default_rng(0)
     space = first.action_space
     assert isinstance(space, gym.spaces.Box)
     actions = rng.uniform(space.low, space.high, (_BEFORE + 2 * _AFTER, *space.low.shape)).astype(np.float32)

@@ -13,9 +13,9 @@ from acmr.agent.precision import MatmulPrecision, choose_products
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.agent.replay_files import ReplayFiles
 from acmr.config import THRESHOLD, flatten, is_neutral, schema_defaults
-from acmr.envs import make_env
+from acmr.envs import check_resume, make_env
 from acmr.envs.physics import PhysicsWarnings, no_log_file
-from acmr.envs.state import ANYTIME, NEVER, RestorableEnv, ResumeCheck, rehearse
+from acmr.envs.state import ANYTIME, NEVER, RestorableEnv, ResumeCheck
 from acmr.records import DIVERGED, EpisodeInProgress
 from acmr.run.checkpointing import CheckpointKey, Checkpoints, CheckpointSchedule
 from acmr.run.preparation import Prepared, arrays_bytes, check_space, prepare
@@ -53,9 +53,10 @@ def run_experiment(spec: RunSpec, say: Callable[[str], None] = print) -> dict[st
     if done is not None:
         return done
     torch.set_num_threads(config.threads)
+    # Before anything else asks for the environment: one of its instances is then tried out for all of them.
+    rehearsal = check_resume(config.env)
     prepared = prepare(spec)
     products = choose_products(config.agent, config.device)
-    rehearsal = rehearse(lambda: make_env(config.env))
     check_space(config, prepared.networks, run_dir.path, run_dir.checkpoint_folder)
     try:
         with run_dir.lock(), run_dir.log(say) as say:
