@@ -7,19 +7,21 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from acmr.agent.learner import find_learner
 from acmr.agent.networks import Networks
 from acmr.agent.precision import choose_products
 from acmr.agent.replay_buffer import ReplayBuffer
-from acmr.agent.sac import SAC
 from acmr.config import SACConfig
 
 TWINS = ("A1", "A2", "A3", "A4")
 
 
-def updates(networks: Networks, batch_size: int = 256, transitions: int = 5_000) -> Callable[[int], None]:
+def updates(
+    networks: Networks, batch_size: int = 256, transitions: int = 5_000, learner: str = "sac"
+) -> Callable[[int], None]:
     """A function that makes some updates on batches of random transitions."""
-    config = SACConfig(hidden_sizes=list(networks.architecture.hidden_sizes), batch_size=batch_size)
-    agent = SAC(networks, config, torch.Generator().manual_seed(1), torch.Generator().manual_seed(2))
+    config = SACConfig(learner, list(networks.architecture.hidden_sizes), batch_size=batch_size)
+    agent = find_learner(config)(networks, config, torch.Generator().manual_seed(1), torch.Generator().manual_seed(2))
     precision = choose_products(config).precision
     dims, rng = networks.dims, np.random.default_rng(0)
     buffer = ReplayBuffer(transitions, dims.observation, dims.action)

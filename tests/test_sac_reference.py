@@ -17,7 +17,7 @@ from acmr.config import SACConfig, TransferConfig
 from acmr.transfer.methods import transfer
 
 SOURCE, TARGET = Dimensions(45, 9), Dimensions(31, 7)
-UPDATES = 100
+UPDATES = 200
 #: Method, freeze and the student's dimensions of the paper's seven cells.
 CELLS = {
     "H0": ("none", False, SOURCE),
@@ -155,7 +155,7 @@ def test_the_code_path_of_a_gpu_takes_the_same_course(cell, teacher_factory, mon
 @pytest.mark.parametrize("cell", CELLS)
 def test_every_cell_to_the_precision_of_float64(cell, teacher_factory):
     config = SACConfig(hidden_sizes=[64, 48], batch_size=96)
-    assert_same_course(lambda: make_networks(cell, (64, 48), teacher_factory), config, updates=50)
+    assert_same_course(lambda: make_networks(cell, (64, 48), teacher_factory), config)
 
 
 @pytest.mark.usefixtures("_double")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from guides import ROOT, copy_checkout, follow
 
 from acmr.agent.architecture import Architecture, Dimensions
 from acmr.agent.networks import Networks
@@ -198,3 +199,10 @@ def test_a_new_method_is_one_function(teacher_factory, monkeypatch):
     networks, report = run(TARGET, teacher_factory(SOURCE, SIZES), "heads", freeze=True)
     assert report.copied == report.frozen == ["critic_1.output"]
     assert not networks.critic_1.output.weight.requires_grad
+
+
+def test_the_guide_to_a_method_of_ones_own(tmp_path):
+    said = follow(ROOT / "docs" / "howto-transfer.md", copy_checkout(tmp_path / "checkout"))
+    report = json.loads(said[said.index("{") :])
+    assert report["copied"] == report["frozen"] == ["critic_1.output", "critic_2.output"]
+    assert "  copied: 130 parameters: critic_1.output, critic_2.output" in said

@@ -22,6 +22,7 @@ def linear(in_features: int, out_features: int, generator: torch.Generator) -> n
 
     Weights and biases are uniform in +-1/sqrt(in_features), as ``torch.nn.Linear.reset_parameters`` has them.
     """
+    # Without its own initialization, which draws from torch's global generator.
     layer: nn.Linear = nn.utils.skip_init(nn.Linear, in_features, out_features)
     bound = 1.0 / math.sqrt(in_features)
     with torch.no_grad():
@@ -46,6 +47,7 @@ class Trunk(nn.Module):
         super().__init__()
         for name, (fan_in, fan_out) in shapes.items():
             self.add_module(name, linear(fan_in, fan_out, generator))
+        # Absent adapters are None rather than missing, so that a pass can ask for them.
         for name in ADAPTERS:
             if name not in shapes:
                 self.register_module(name, None)
@@ -114,6 +116,7 @@ class Actor(Trunk):
             (Haarnoja et al. 2018, appendix C; 1e-6 as in CleanRL).
         """
         mean, log_std = self(observations)
+        # The noise is given, so that the gradient reaches mean and log_std, and two learners can draw the same.
         squashed = torch.tanh(mean + log_std.exp() * noise)
         gaussian = -0.5 * noise.square() - log_std - _HALF_LOG_2PI
         log_prob = gaussian - torch.log(self.action_scale * (1.0 - squashed.square()) + 1e-6)

@@ -63,6 +63,7 @@ def use_fast_float32(tolerance: float = TOLERANCE) -> MatmulPrecision:
     Raises:
         RuntimeError: If even the default products are less accurate than that.
     """
+    # The setting alone does not say what a processor makes of it; its results do.
     torch.set_float32_matmul_precision("medium")
     error = relative_error()
     return MatmulPrecision("medium", error) if error <= tolerance else _use_default("cpu", tolerance, error)
@@ -84,6 +85,7 @@ def relative_error(device: str = "cpu") -> float:
         left = torch.randn(2, rows, inner, generator=generator).to(device)
         right = torch.randn(2, inner, columns, generator=generator).to(device)
         exact = left.double() @ right.double()
+        # Libraries choose another kernel for transposed operands, as gradients have them, and for batched ones.
         for first, second in (
             (left, right),
             (left.mT.contiguous().mT, right),

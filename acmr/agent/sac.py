@@ -62,6 +62,7 @@ class SAC:
         self._build_networks()
         start = log_alpha if config.autotune else math.log(config.alpha)
         self.log_alpha = torch.full((1,), start, device=device)
+        # The temperature is read several times for each time it changes, so its exponential is kept beside it.
         self._alpha, self._log_alpha_gradient = self.log_alpha.exp(), torch.zeros(1, device=device)
         self._alpha_array = array_of(self._alpha)
         self._optimizers = {
@@ -74,6 +75,8 @@ class SAC:
 
     def _build_networks(self) -> None:
         actor, critics, dims = self.networks.actor, self.networks.critics, self.networks.dims
+        # Twin layers lie side by side in memory and learn as one block (:class:`FlatParameters`); the order is that of
+        # their application.
         self._reduced = self.config.precision == "bfloat16"
         low_actor, low_critics = ([self._reduced and not head for head in _heads(net)] for net in (actor, critics[0]))
         self._actor_parameters = FlatParameters(_actor_groups(actor), reduced=low_actor)
@@ -106,6 +109,7 @@ class SAC:
         The critics learn at every step. Every ``policy_frequency`` steps the actor makes up for its delay
         with as many updates on this batch, each followed by a temperature update.
         """
+        # Critics read observation and action side by side. The replay buffer gathers them so: then this joins nothing.
         joined = JoinedBatch.join(batch)
         if self._reduced:
             joined = joined.to(torch.bfloat16)
@@ -163,6 +167,7 @@ class SAC:
         self._batch_size = batch_size
         self._actor_places, self._critic_places = self._actor.allocate(batch_size), self._critics.allocate(batch_size)
         self._noise = torch.zeros((batch_size, self.networks.dims.action), device=self.device)
+        # A product with 1 / n is a mean, in one call for both critics.
         self._average = array_of(torch.full((batch_size,), 1.0 / batch_size, device=self.device))
         # What the arithmetic between the networks reads and writes: views that are made once.
         heads, values = self._actor_places[-1], self._critic_places[-1]
@@ -184,6 +189,7 @@ class SAC:
             room.copy_(tensor_of(after.actions))
         else:
             array_of(room)[...] = after.actions
+        # Targets and critics take turns in the same memory: their values are used up before the critics' pass.
         self._targets.forward(batch.next_inputs, self._critic_places)
         soft_value = self._math.minimum(values[0], values[1]) - alpha * after.log_prob
         # Truncation is not an end: only a terminated transition has no future (reference, section 2).
@@ -203,6 +209,7 @@ class SAC:
 
     def _update_actor_and_temperature(self, observations: Tensor) -> None:
         updates = self.config.policy_frequency
+        # All of the actor's updates read the same observations, and the critics stand still meanwhile.
         self._critics.share(observations)
         self._actor.forward(observations, self._actor_places)
         for remaining in reversed(range(updates)):

@@ -116,6 +116,7 @@ def save_teacher(folder: Path, networks: Networks, description: TeacherDescripti
     data = save_tensors(tensors)
     content = asdict(description) | {"sha256": hashlib.sha256(data).hexdigest()}
     content["description_sha256"] = _description_sha256(content)
+    # The description last: it names the hash of the tensors, so a kill in between leaves a pair that is refused.
     write_bytes(folder / TENSOR_FILE, data)
     write_json(folder / DESCRIPTION_FILE, content)
 

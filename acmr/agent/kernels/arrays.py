@@ -1,4 +1,4 @@
-"""Small arrays between and beside the matrix products.
+"""The same arithmetic by NumPy on the CPU and by torch elsewhere, for the small arrays around matrix products.
 
 On the CPU they are NumPy's, in the memory of torch's tensors: a call of NumPy on a few thousand numbers takes a third
 of the time of torch's. Elsewhere they are tensors. Formulas that use what both have are the same text for both.
@@ -21,6 +21,7 @@ NUMPY_DEVICES = {"cpu"}
 
 def array_of(tensor: Tensor) -> Array:
     """The tensor's memory as a small array."""
+    # No copy: both libraries read and write one memory, so what either of them changes the other one sees.
     return tensor.numpy() if tensor.device.type in NUMPY_DEVICES else tensor
 
 

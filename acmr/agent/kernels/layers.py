@@ -16,6 +16,7 @@ from torch import Tensor
 from acmr.agent.kernels.arrays import Array, array_of, math_of
 from acmr.agent.kernels.parameters import LayerParameters
 
+# The operation that autograd itself calls for ReLU; torch offers no public form that writes to memory of one's own.
 _relu_backward = torch.ops.aten.threshold_backward.grad_input
 
 
@@ -35,14 +36,17 @@ class Activations:
     def __init__(self, layer: Dense, batch_size: int, below: Activations | None) -> None:
         self.output = layer.weight.new_zeros(layer.networks, batch_size, layer.fan_out)
         self.gradient = torch.zeros_like(self.output)
+        # Views by network, made once: made in each pass, they and the transposes would cost 3% of an update.
         self.outputs, self.gradients = list(self.output), list(self.gradient)
         read = written = self.output.new_empty(0, 0, 0)
         self._below = None
         if below:
             read, written = below.output, below.gradient
+            # Where bfloat16 ends: the heads are in float32, since a Q value rounded to 8 bits would say little.
             if below.output.dtype != self.output.dtype:
                 read, written = (torch.zeros_like(tensor, dtype=self.output.dtype) for tensor in (read, written))
                 self._below = (below.output, below.gradient, read, written)
+            # Mean and log_std come from one product side by side, and their adapters read one half each.
             read, written = columns(read, layer.networks), columns(written, layer.networks)
         self.inputs, self.input_gradient = read, written
         self.inputs_transposed = self.inputs.transpose(1, 2)
@@ -84,6 +88,7 @@ class Dense:
     def __init__(self, block: LayerParameters, relu: bool) -> None:
         self.weight, self.bias, self.relu = block.weight, block.bias, relu
         self.networks, self.fan_in, self.fan_out = block.weight.shape
+        # Weights lie as (in, out), so that a batch times a weight reads both operands row by row.
         self._transposed, self._weights = block.weight.transpose(1, 2), list(block.weight)
         self.learns = block.weight_gradient is not None
         if block.weight_gradient is not None and block.bias_gradient is not None:
@@ -93,11 +98,13 @@ class Dense:
     def forward(self, place: Activations) -> None:
         """Writes the output."""
         place.fetch()
+        # Both critics in one call: one after the other takes 6% longer (docs/performance.md).
         torch.bmm(place.inputs, self.weight, out=place.output)
         self.finish(place.output)
 
     def forward_shared(self, inputs: Tensor, place: Activations) -> None:
         """Writes the output for inputs (batch, in) that all networks read."""
+        # A batched product would first copy the inputs, the largest operand there is, since it shares none.
         for weight, output in zip(self._weights, place.outputs, strict=True):
             torch.mm(inputs, weight, out=output)
         self.finish(place.output)
@@ -111,10 +118,12 @@ class Dense:
     def through_activation(self, place: Activations) -> None:
         """Takes the gradient of the output to that of the sum before the activation."""
         if self.relu:
+            # ReLU passes a gradient on where its output is above 0: the sum before it need not be kept.
             _relu_backward(place.gradient, place.output, 0.0, grad_input=place.gradient)
 
     def parameter_gradients(self, place: Activations) -> None:
         """Writes the gradients of weight and bias."""
+        # With y = x W + b: dW = x^T dy and db = the sum of dy over the batch.
         torch.bmm(place.inputs_transposed, place.gradient, out=self._weight_gradient)
         torch.sum(place.gradient, dim=1, keepdim=True, out=self._bias_gradient)
 
@@ -127,6 +136,7 @@ class Dense:
 
     def input_gradient(self, place: Activations) -> None:
         """Writes the gradient of the inputs."""
+        # dx = dy W^T, with the transposed view of the weights, which a product takes without a copy.
         torch.bmm(place.gradient, self._transposed, out=place.input_gradient)
         place.hand_down()
 
@@ -136,6 +146,7 @@ class Scalar(Dense):
 
     def __init__(self, block: LayerParameters, relu: bool) -> None:
         super().__init__(block, relu)
+        # A product with one column has no use of the kernels for matrices; NumPy's call is cheaper than torch's.
         self._math = math_of(block.weight)
         self._vectors = [array_of(weight[:, 0]) for weight in block.weight]
         if self.learns:
@@ -156,6 +167,7 @@ class Scalar(Dense):
 
     def input_gradient(self, place: Activations) -> None:
         """Writes the gradient of the inputs."""
+        # (batch, 1) times (1, in) is an outer product: no sums, so a plain multiplication with broadcasting.
         torch.mul(place.gradient, self._transposed, out=place.input_gradient)
         place.hand_down()
 
@@ -169,9 +181,11 @@ class Stack:
     """
 
     def __init__(self, blocks: Sequence[LayerParameters], relus: Sequence[bool]) -> None:
+        # The first layer reads what no place holds, so it is never the special case of one output.
         kinds = [Dense, *(Scalar if block.weight.shape[2] == 1 else Dense for block in blocks[1:])]
         self.layers = [kind(block, relu) for kind, block, relu in zip(kinds, blocks, relus, strict=True)]
         learning = [index for index, layer in enumerate(self.layers) if layer.learns]
+        # Below the lowest layer that learns nobody asks for a gradient: frozen cells end their way back there.
         self._lowest_learning = min(learning, default=len(self.layers))
 
     def allocate(self, batch_size: int) -> list[Activations]:
@@ -197,6 +211,7 @@ class Stack:
         for index in range(len(self.layers) - 1, self._lowest_learning - 1, -1):
             layer, place = self.layers[index], places[index]
             layer.through_activation(place)
+            # A frozen layer hands the gradient down to those below it and computes none of its own.
             if layer.learns and index:
                 layer.parameter_gradients(place)
             elif layer.learns:
@@ -207,6 +222,8 @@ class Stack:
     def backward_to_first(self, places: Sequence[Activations]) -> None:
         """Leaves the gradient of the first layer's sums in its place; the parameters' gradients stay as they are."""
         for index in range(len(self.layers) - 1, -1, -1):
+            # The actor's update asks how values change with actions and changes no critic: without the gradients of
+            # their weights an update takes 1 / 1.15 of the time.
             layer, place = self.layers[index], places[index]
             layer.through_activation(place)
             if index:
@@ -228,6 +245,7 @@ class CriticStack(Stack):
     def __init__(self, blocks: Sequence[LayerParameters], relus: Sequence[bool], observation_dim: int) -> None:
         super().__init__(blocks, relus)
         weight = blocks[0].weight
+        # [s, a] W = s W_s + a W_a: the upper rows of the weight belong to the observation, the others to the action.
         self._of_observations = list(weight[:, :observation_dim])
         self._of_actions = list(weight[:, observation_dim:])
         self._of_actions_transposed = [part.t() for part in self._of_actions]
@@ -243,6 +261,7 @@ class CriticStack(Stack):
 
     def forward_actions(self, actions: Tensor, places: Sequence[Activations]) -> Tensor:
         """Values, (networks, batch, 1), of actions (batch, action) at the observations that were shared."""
+        # The sums for the observations are kept: addmm writes shared + a W_a elsewhere.
         actions = actions.to(self.layers[0].weight.dtype)
         for shared, weight, sums in zip(self._shared, self._of_actions, places[0].outputs, strict=True):
             torch.addmm(shared, actions, weight, out=sums)
@@ -253,6 +272,7 @@ class CriticStack(Stack):
     def action_gradient(self, places: Sequence[Activations]) -> Tensor:
         """Gradient of the actions, (batch, action), given that of the values in the last place."""
         self.backward_to_first(places)
+        # Both critics read the same actions, so their gradients add up (one of them is zero in each row).
         (first, *others), (weight, *weights) = places[0].gradients, self._of_actions_transposed
         gradient = torch.mm(first, weight)
         for of_network, weight in zip(others, weights, strict=True):

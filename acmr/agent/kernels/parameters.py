@@ -11,13 +11,18 @@ from torch import Tensor, nn
 #: Layers of equal shape that work side by side: by network, and within a network those that read the same input.
 Group = Sequence[Sequence[nn.Linear]]
 
-#: Blocks begin on multiples of this many numbers: 64 bytes, a cache line and a vector register of AVX-512.
+#: Blocks begin on multiples of this many numbers: 64 bytes, a cache line and a vector register of AVX-512. A product
+#: on a block that begins elsewhere would load two lines for each vector. What fills the gaps is zero, and so is its
+#: gradient, so that Adam leaves it zero.
 _ALIGNMENT = 16
 
 
 @dataclass(frozen=True)
 class LayerParameters:
-    """A group's parameters: (networks, in, out) and (networks, 1, out); gradients are None where frozen."""
+    """A group's parameters: (networks, in, out) and (networks, 1, out); gradients are None where frozen.
+
+    The bias has a dimension of one for the batch, so that it is added to (networks, batch, out) as it is.
+    """
 
     weight: Tensor
     bias: Tensor
@@ -55,6 +60,7 @@ class FlatParameters:
         reduced = reduced or [False] * len(groups)
         device, dtype = groups[0][0][0].weight.device, groups[0][0][0].weight.dtype
         sizes = [sum(_padded_sizes(group)) for group in groups]
+        # Frozen parameters lie behind the end of what the optimizer steps: not even their moments exist.
         # What learns comes first, and of that what is reduced, so that one copy collects its gradients.
         order = sorted(range(len(groups)), key=lambda index: (self.frozen[index], not reduced[index]))
         ends = torch.tensor([0, *(sizes[index] for index in order)]).cumsum(0).tolist()
@@ -67,6 +73,8 @@ class FlatParameters:
             _move_into(block, group)
         self.blocks, self._copies = self.masters, None
         if any(reduced):
+            # Adam's steps are far smaller than bfloat16 can tell from nothing beside a weight, so it steps float32
+            # masters, and products read a copy that is made anew after each step.
             low_values, low_gradient = self._copies = self.values.bfloat16(), self.gradient.bfloat16()
             self._collected = ends[sum(low and not frozen for low, frozen in zip(reduced, self.frozen, strict=True))]
             self.blocks = [
@@ -88,6 +96,7 @@ class FlatParameters:
         networks, fan_in, fan_out = _shape(group)
         weights, _ = _padded_sizes(group)
 
+        # Values and gradients have the same layout, so that one slice of each is what the optimizer sees.
         def views(vector: Tensor) -> tuple[Tensor, Tensor]:
             weight = vector[start : start + networks * fan_in * fan_out].view(networks, fan_in, fan_out)
             bias = vector[start + weights : start + weights + networks * fan_out].view(networks, 1, fan_out)
@@ -112,6 +121,7 @@ class Adam:
     def __init__(self, values: Tensor, gradient: Tensor, lr: float) -> None:
         self._mean, self._square = torch.zeros_like(values), torch.zeros_like(values)
         self._steps, self._lr = torch.zeros((), device=values.device), lr
+        # The kernel takes lists of tensors; the empty one is that of AMSGrad.
         self._lists: tuple[list[Tensor], ...] = (
             [values], [gradient], [self._mean], [self._square], [], [self._steps],
         )  # fmt: skip
@@ -162,5 +172,6 @@ def _move_into(block: LayerParameters, group: Group) -> None:
 
 
 def _move(parameter: Tensor, place: Tensor) -> None:
+    # The module keeps its parameter, which from now on is this memory: whoever reads the module reads it there.
     place.copy_(parameter.data)
     parameter.data = place

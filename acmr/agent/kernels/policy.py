@@ -14,6 +14,7 @@ from acmr.agent.kernels.layers import Dense
 from acmr.agent.networks import LOG_STD_MAX, LOG_STD_MIN
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+# log_std = low + (high - low) / 2 (tanh(raw) + 1), as center and reach (CleanRL).
 _CENTER, _REACH = 0.5 * (LOG_STD_MAX + LOG_STD_MIN), 0.5 * (LOG_STD_MAX - LOG_STD_MIN)
 #: Keeps the logarithm of the squashing finite (CleanRL).
 _SMALL = 1e-6
@@ -57,6 +58,8 @@ class SquashedGaussian:
         std = self._math.exp(log_std)
         # torch's tanh on either device: near +-1 its last bit decides 1 - tanh^2, so it is the one of the networks.
         squashed = array_of(tensor_of(std * noise + mean).tanh_())
+        # Change of variables (Haarnoja et al. 2018, appendix C): log pi(a) = log N(x) - log |da/dx|, with
+        # a = scale tanh(x) + bias, so da/dx = scale (1 - tanh(x)^2), summed over the actions.
         slope = (1.0 - squashed * squashed) * self._scale
         less = self._math.log(slope + _SMALL) + log_std + noise * noise * 0.5 + _HALF_LOG_2PI
         actions = squashed * self._scale + self._bias
@@ -75,6 +78,8 @@ class SquashedGaussian:
             of_mean: Where the gradient of the mean goes, (batch, action).
             of_raw: Where that of the raw log_std goes, (batch, action).
         """
+        # x = mean + std noise, so dmean = dx and dlog_std = dx std noise; log pi also has -log_std itself, by which its
+        # gradient is -1. The noise is a constant here, as reparameterization has it.
         bend = sample.squashed / (sample.slope + _SMALL) * (2.0 * of_log_prob)
         of_mean[...] = (bend + of_actions) * sample.slope
         of_log_std = of_mean * sample.std * sample.noise - of_log_prob
@@ -98,8 +103,10 @@ class NumpyPolicy:
 
     def __call__(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """The action, (action,), for an observation (observation,) and standard normal draws (action,)."""
+        # Environments return float64; the weights are float32, and a mixed product would convert them in each step.
         hidden = observation.astype(np.float32)
         for weight, bias, relu in self._layers:
+            # More than one network at a time are the adapters of mean and log_std, which read a half each.
             if len(weight) == 1:
                 hidden = hidden @ weight[0] + bias[0, 0]
             else:
