@@ -13,6 +13,8 @@ from docs.rooms import PACKAGES, PICTURE, ROOT, draw, imports, module_of, module
 PAGE = ROOT / "docs" / "architecture.md"
 #: Modules of one package; a longer list is no map.
 MOST_MODULES = 10
+#: Modules of ours that one module may import; whoever needs more does the work of several.
+MOST_IMPORTS = 15
 #: Modules of ours that one of the analysis may import; what knows more than that should be told the rest.
 MOST_IMPORTS = 15
 #: Packages that may know Hydra; below them settings are plain dataclasses.
@@ -102,6 +104,12 @@ def test_the_files_of_a_run_and_its_states_are_named_in_records_only():
         for text in literals(path):
             assert not [name for name in files if name in text], f"{names(path)}: {text}"
             assert text not in (*records.ENDED, records.RUNNING), f"{names(path)}: {text}"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_module_imports_too_many_of_ours(module):
+    found = sorted(imports(MODULES[module]) & MODULES.keys() - {module})
+    assert len(found) <= MOST_IMPORTS, f"{module} imports {len(found)}: {', '.join(found)}"
 
 
 def test_no_package_has_too_many_modules():

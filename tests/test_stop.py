@@ -15,7 +15,7 @@ from torture import ANT, Run, at_step, parts, same
 
 from acmr.config import ExperimentConfig, flatten
 from acmr.records import meets_threshold, steps_to_threshold
-from acmr.run import experiment
+from acmr.run import checkpointing
 
 CONSECUTIVE = 3
 #: Twelve episodes of 25 steps; learning starts within the third.
@@ -159,7 +159,7 @@ def test_a_setting_that_is_added_to_the_schema_voids_no_checkpoint(tmp_path, mon
     config = Run(tmp_path, FULL).spec.config
     before = digest(config)
     assert digest(replace(config, threshold=1.0)) != before
-    monkeypatch.setattr(experiment, "schema_defaults", lambda: flatten(asdict(Later())))
+    monkeypatch.setattr(checkpointing, "schema_defaults", lambda: flatten(asdict(Later())))
     assert digest(Later(**vars(config))) == before
     assert digest(Later(**vars(config), noise=0.1)) != before
 

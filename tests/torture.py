@@ -19,16 +19,12 @@ from functools import cache
 from pathlib import Path
 
 import acmr.run.experiment as experiment
-from acmr.agent.precision import MatmulPrecision, choose_products
 from acmr.agent.replay_buffer import ReplayBuffer
 from acmr.config import ConfigError
-from acmr.envs import check_resume
-from acmr.envs.state import ResumeCheck
-from acmr.run import reproducibility, summary
-from acmr.run.checkpointing import Checkpoints, CheckpointSchedule
+from acmr.run import reproducibility, summary, trainer
+from acmr.run.checkpointing import Checkpoints, CheckpointSchedule, make_checkpoints
 from acmr.run.preparation import Prepared, prepare
-from acmr.run.run_state import RunState
-from acmr.run.stop_signals import StopSignals
+from acmr.run.run_state import RunState, make_state
 from acmr.settings.compose import compose_config, parse
 from acmr.settings.run_spec import RunSpec, specify
 from acmr.storage import durable
@@ -58,13 +54,12 @@ def spec(output: Path, *overrides: str) -> RunSpec:
 
 
 @cache
-def found_out(overrides: tuple[str, ...]) -> tuple[Prepared, ResumeCheck, MatmulPrecision]:
+def found_out(overrides: tuple[str, ...]) -> Prepared:
     """What a run finds out of its settings before it touches the disk, found out once."""
     made = spec(Path("unused"), *overrides)
     # Whoever edits the program while these tests run does not change it for them.
     reproducibility._program()
-    products = choose_products(made.config.agent, made.config.device)
-    return prepare(made), check_resume(made.config.env), products
+    return prepare(made)
 
 
 @dataclass
@@ -127,13 +122,11 @@ class Run:
             (self.output / "buffer.sha256").write_text(content_hash(buffers[-1]))
             save(*arguments)
 
-        experiment.ReplayBuffer, experiment.save_teacher = Watched, note_and_save
+        trainer.ReplayBuffer, experiment.save_teacher = Watched, note_and_save
         # What every process of a run would find out again; no process changes it for another.
-        prepared, rehearsal, products = found_out(self.overrides)
+        prepared = found_out(self.overrides)
         experiment.prepare = lambda made: replace(prepared, spec=made)
-        experiment.check_resume = lambda env: rehearsal
         summary.git_commit = lambda: "a commit"
-        experiment.choose_products = lambda agent, device: products
         try:
             prepare()
             made_of_it = experiment.run_experiment(made)
@@ -179,10 +172,9 @@ class Run:
 
 def parts(run: Run) -> tuple[RunState, Checkpoints]:
     """The parts of a run in this process, as they are before its first step."""
-    prepared, rehearsal, products = found_out(run.overrides)
-    prepared = deepcopy(replace(prepared, spec=run.spec))
-    session = experiment.Session(prepared, rehearsal, products, RunDir(run.folder), StopSignals(), print)
-    return session.build()
+    prepared, run_dir = deepcopy(replace(found_out(run.overrides), spec=run.spec)), RunDir(run.folder)
+    state = make_state(prepared, run_dir)
+    return state, make_checkpoints(prepared, state, run_dir)
 
 
 def same(outcome: dict[str, bytes], untouched: dict[str, bytes]) -> None:

@@ -6,17 +6,19 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from acmr.config import INEXACT, ConfigError
+from acmr.config import INEXACT, ConfigError, flatten, is_neutral, schema_defaults
 from acmr.envs.state import ANYTIME, NEVER
 from acmr.records import DamagedError
-from acmr.run.reproducibility import differences
-from acmr.run.run_state import RunState
+from acmr.run.preparation import Prepared
+from acmr.run.reproducibility import differences, fingerprint
+from acmr.run.run_state import RunState, arrays_bytes
 from acmr.run.stop_signals import Stopped, StopSignals
 from acmr.run.trainer import is_finite
 from acmr.storage.checkpoint_store import KEPT, FormatError, Snapshot, SnapshotStore
+from acmr.storage.run_dir import RunDir
 from acmr.tracking.observer import Observer
 
 #: Steps between two checkpoints where none are set: a share of the run, within these bounds.
@@ -167,28 +169,61 @@ class Checkpoints:
         return str(self._store.state_file(step))
 
 
+def make_checkpoints(prepared: Prepared, state: RunState, run_dir: RunDir) -> Checkpoints:
+    """Makes what stores the state of a run in its directory; touches no disk."""
+    store = SnapshotStore(run_dir.checkpoint_folder, arrays_bytes(prepared.networks))
+    return Checkpoints(store, state, _key(prepared))
+
+
+def discard_checkpoints(run_dir: RunDir) -> None:
+    """Removes the checkpoints of a run that needs them no more."""
+    SnapshotStore(run_dir.checkpoint_folder, 0).clear()
+
+
+def _key(prepared: Prepared) -> CheckpointKey:
+    spec, report, usual = prepared.spec, asdict(prepared.report), schema_defaults()
+    # Only what differs from the schema's defaults: a setting that is added to it voids no checkpoint then.
+    settings = {
+        key: value
+        for key, value in flatten(spec.settings).items()
+        if not is_neutral(key) and key != "transfer.teacher" and (key not in usual or value != usual[key])
+    }
+    # One teacher may be reached by several paths; its hash says which it is.
+    teacher = {**(report["teacher"] or {}), "path": None}
+    return CheckpointKey(
+        run={"settings": settings, "transfer": {**report, "teacher": teacher}},
+        fingerprint=fingerprint(spec.config.threads, spec.config.device, prepared.resume_check.trace),
+        command=lambda: spec.command,
+        mode=spec.config.resume,
+    )
+
+
 class CheckpointSchedule(Observer):
     """Decides after each step whether a checkpoint is made, and whether the run stops.
 
     Args:
         checkpoints: Makes them.
+        prepared: What the run starts with; says how often it wants them, and when its environment can be stored.
         state: The parts of the run.
-        every: Steps between two; None: as the length of the run suggests; 0: none are made.
-        when: When the environment's state can be captured (:mod:`acmr.envs.state`).
         stop: Says whether the run is to stop.
-        say: Takes a line for the user.
+        say: Takes a line for the user, at once if the environment cannot be stored at every step.
     """
 
     def __init__(
         self,
         checkpoints: Checkpoints,
+        prepared: Prepared,
         state: RunState,
-        every: int | None,
-        when: str,
         stop: StopSignals,
         say: Callable[[str], None],
     ) -> None:
         self._checkpoints, self._trainer, self._stop, self._say = checkpoints, state.trainer, stop, say
+        every, when = prepared.spec.config.checkpoint_every, prepared.resume_check.when
+        if when != ANYTIME and every != 0:
+            made = "not be stored: no checkpoints are made, and a run that was stopped begins anew"
+            if when != NEVER:
+                made = "be stored between episodes only: checkpoints wait for the end of one"
+            say(f"{prepared.spec.directory}: the state of {prepared.spec.config.env.name} can {made}")
         self._makes_any, self._anytime = when != NEVER and every != 0, when == ANYTIME
         total = self._trainer.total_timesteps
         self._interval = every or min(max(total // _SHARE, _LEAST), _MOST)

@@ -1,4 +1,4 @@
-"""One run from its settings to its results: the only place where everything is put together."""
+"""One run from its settings to its results: what is done in which order, and what is said to the user."""
 
 from __future__ import annotations
 
@@ -9,24 +9,15 @@ from typing import Any
 
 import torch
 
-from acmr.agent.precision import MatmulPrecision, choose_products
-from acmr.agent.replay_buffer import ReplayBuffer
-from acmr.agent.replay_files import ReplayFiles
-from acmr.config import THRESHOLD, flatten, is_neutral, schema_defaults
-from acmr.envs import check_resume, make_env
-from acmr.envs.physics import PhysicsWarnings, no_log_file
-from acmr.envs.state import ANYTIME, NEVER, RestorableEnv, ResumeCheck
-from acmr.records import DIVERGED, EpisodeInProgress
-from acmr.run.checkpointing import CheckpointKey, Checkpoints, CheckpointSchedule
-from acmr.run.preparation import Prepared, arrays_bytes, check_space, prepare
-from acmr.run.reproducibility import fingerprint
-from acmr.run.run_logs import RunLogs
-from acmr.run.run_state import RunState
+from acmr.envs.physics import no_log_file
+from acmr.records import DIVERGED
+from acmr.run.checkpointing import Checkpoints, CheckpointSchedule, discard_checkpoints, make_checkpoints
+from acmr.run.preparation import Prepared, prepare
+from acmr.run.run_state import RunState, check_space, make_state
 from acmr.run.stop_signals import StopSignals
 from acmr.run.summary import describe_teacher, reached, summarize
 from acmr.run.trainer import DivergedError, Trainer
 from acmr.settings.run_spec import RunSpec
-from acmr.storage.checkpoint_store import SnapshotStore
 from acmr.storage.durable import StorageError, WriteError
 from acmr.storage.run_dir import RunDir, RunHeldError, holds_run
 from acmr.tracking.observer import close_all
@@ -53,10 +44,7 @@ def run_experiment(spec: RunSpec, say: Callable[[str], None] = print) -> dict[st
     if done is not None:
         return done
     torch.set_num_threads(config.threads)
-    # Before anything else asks for the environment: one of its instances is then tried out for all of them.
-    rehearsal = check_resume(config.env)
     prepared = prepare(spec)
-    products = choose_products(config.agent, config.device)
     check_space(config, prepared.networks, run_dir.path, run_dir.checkpoint_folder)
     try:
         with run_dir.lock(), run_dir.log(say) as say:
@@ -65,7 +53,7 @@ def run_experiment(spec: RunSpec, say: Callable[[str], None] = print) -> dict[st
             if done is not None:
                 return done
             with StopSignals() as stop, no_log_file():
-                return Session(prepared, rehearsal, products, run_dir, stop, say).run()
+                return Session(prepared, run_dir, stop, say).run()
     except WriteError as error:
         raise StorageError(run_dir.path, error) from error
 
@@ -87,7 +75,7 @@ def _finished(spec: RunSpec, run_dir: RunDir, say: Callable[[str], None]) -> dic
     if run_dir.checkpoint_folder.exists():
         # It was killed between its last two acts.
         with suppress(RunHeldError, WriteError), run_dir.lock():
-            SnapshotStore(run_dir.checkpoint_folder, 0).clear()
+            discard_checkpoints(run_dir)
     say(f"{run_dir}: complete already{reached(summary)}; force=true runs it anew")
     return summary
 
@@ -97,8 +85,6 @@ class Session:
     """One process's work on a run that it holds."""
 
     prepared: Prepared
-    rehearsal: ResumeCheck
-    products: MatmulPrecision
     run_dir: RunDir
     stop: StopSignals
     say: Callable[[str], None]
@@ -107,7 +93,8 @@ class Session:
         """Trains to the end, and stores what came of it."""
         for line in [f"run: {self.run_dir}", *self.prepared.report.lines()]:
             self.say(line)
-        state, checkpoints = self.build()
+        state = make_state(self.prepared, self.run_dir)
+        checkpoints = make_checkpoints(self.prepared, state, self.run_dir)
         try:
             self._start(checkpoints, state)
             return self._train(checkpoints, state)
@@ -116,28 +103,6 @@ class Session:
         finally:
             state.logs.close()
             state.trainer.env.close()
-
-    def build(self) -> tuple[RunState, Checkpoints]:
-        """Makes the parts of the run as they are before its first step; touches no disk."""
-        prepared, config, folder = self.prepared, self.prepared.spec.config, self.run_dir.checkpoint_folder
-        dims, streams, about = prepared.networks.dims, prepared.streams, prepared.about
-        env, logs = RestorableEnv(make_env(config.env)), RunLogs(self.run_dir, about)
-        warnings = PhysicsWarnings(env)
-        trainer = Trainer(
-            env=warnings,
-            agent=prepared.learner(
-                prepared.networks, config.agent, streams.acting, streams.learning, prepared.log_alpha, config.device
-            ),
-            buffer=ReplayBuffer(config.agent.buffer_size, dims.observation, dims.action, config.device),
-            streams=streams,
-            total_timesteps=config.most_steps,
-            log_every=config.log_every,
-            episode=EpisodeInProgress(about.reward_terms, about.has_forward_velocity),
-            is_satisfied=lambda: config.stop == THRESHOLD and logs.meet(config.threshold, config.consecutive),
-        )
-        state = RunState(trainer, env, warnings, ReplayFiles(folder, trainer.buffer), logs)
-        store = SnapshotStore(folder, arrays_bytes(prepared.networks))
-        return state, Checkpoints(store, state, self._conditions())
 
     def _start(self, checkpoints: Checkpoints, state: RunState) -> None:
         spec, run_dir, trainer = self.prepared.spec, self.run_dir, state.trainer
@@ -152,17 +117,10 @@ class Session:
             state.logs.begin()
         if not run_dir.transfer_file.exists():
             run_dir.write_json(run_dir.transfer_file, asdict(self.prepared.report))
-        if self.rehearsal.when != ANYTIME and spec.config.checkpoint_every != 0:
-            made = "not be stored: no checkpoints are made, and a run that was stopped begins anew"
-            if self.rehearsal.when != NEVER:
-                made = "be stored between episodes only: checkpoints wait for the end of one"
-            self.say(f"{run_dir}: the state of {spec.config.env.name} can {made}")
 
     def _train(self, checkpoints: Checkpoints, state: RunState) -> dict[str, Any]:
         spec, trainer, run_dir = self.prepared.spec, state.trainer, self.run_dir
-        schedule = CheckpointSchedule(
-            checkpoints, state, spec.config.checkpoint_every, self.rehearsal.when, self.stop, self.say
-        )
+        schedule = CheckpointSchedule(checkpoints, self.prepared, state, self.stop, self.say)
         # The run's own record comes first, whatever becomes of those that show it; a checkpoint of a step holds all of
         # that step, so its schedule comes last.
         watchers = make_watchers(spec, trainer.global_step, self.say)
@@ -204,29 +162,12 @@ class Session:
         self, checkpoints: Checkpoints, state: RunState, diverged: DivergedError | None = None
     ) -> dict[str, Any]:
         more = {
-            "matrix_products": asdict(self.products),
+            "matrix_products": asdict(self.prepared.products),
             "physics_warnings": dict(state.warnings.counts),
             "inexact_resumes": checkpoints.inexact,
         }
         steps, history = state.trainer.global_step, state.logs.history
         return summarize(self.prepared.spec, history, steps, state.clock.seconds, diverged) | more
-
-    def _conditions(self) -> CheckpointKey:
-        spec, report, usual = self.prepared.spec, asdict(self.prepared.report), schema_defaults()
-        # Only what differs from the schema's defaults: a setting that is added to it voids no checkpoint then.
-        settings = {
-            key: value
-            for key, value in flatten(spec.settings).items()
-            if not is_neutral(key) and key != "transfer.teacher" and (key not in usual or value != usual[key])
-        }
-        # One teacher may be reached by several paths; its hash says which it is.
-        teacher = {**(report["teacher"] or {}), "path": None}
-        return CheckpointKey(
-            run={"settings": settings, "transfer": {**report, "teacher": teacher}},
-            fingerprint=fingerprint(spec.config.threads, spec.config.device, self.rehearsal.trace),
-            command=lambda: spec.command,
-            mode=spec.config.resume,
-        )
 
 
 def _train(trainer: Trainer) -> DivergedError | None:

@@ -2,38 +2,43 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
 from acmr.agent.architecture import Architecture, Dimensions
 from acmr.agent.learner import Learner, find_learner
 from acmr.agent.networks import Networks
-from acmr.agent.replay_files import replay_bytes
+from acmr.agent.precision import MatmulPrecision, choose_products
 from acmr.config import ConfigError, ExperimentConfig
-from acmr.envs import EnvDescription, describe
+from acmr.envs import EnvDescription, check_resume, describe
+from acmr.envs.state import ResumeCheck
 from acmr.records import TENSOR_FILE
 from acmr.run.random_streams import RandomStreams, random_streams
 from acmr.settings.run_spec import RunSpec, teacher_spec
-from acmr.storage.checkpoint_store import KEPT
 from acmr.storage.run_dir import RunDir
-from acmr.text import size
 from acmr.tracking.watchers import tracker_class
 from acmr.transfer.methods import check_body, transfer
 from acmr.transfer.report import TransferReport
 from acmr.transfer.teacher import Teacher, load_teacher
 
-#: Logs, settings and whatever is small, in bytes.
-_SMALL = 1 << 20
-
 
 @dataclass(frozen=True)
 class Prepared:
-    """All that a run needs and that could be wrong, made and checked before anything is written."""
+    """All that a run needs and that could be wrong, made and checked before anything is written.
+
+    Attributes:
+        spec: The run.
+        about: Its environment.
+        networks: Those that it starts with.
+        report: What the transfer made of them.
+        learner: Makes the learner that ``agent`` chooses.
+        log_alpha: Logarithm of the temperature that it starts with.
+        streams: Its random numbers.
+        products: How matrix products are computed from now on.
+        resume_check: When the environment's state can be stored.
+    """
 
     spec: RunSpec
     about: EnvDescription
@@ -42,14 +47,22 @@ class Prepared:
     learner: Callable[..., Learner]
     log_alpha: float
     streams: RandomStreams
+    products: MatmulPrecision
+    resume_check: ResumeCheck
 
 
 def prepare(spec: RunSpec) -> Prepared:
-    """Builds the networks that a run starts with, with everything its teacher gives."""
+    """Makes what a run starts with, and refuses what cannot be run; touches no disk.
+
+    Raises:
+        ConfigError: With one line that says what to type instead.
+    """
     config = spec.config
     _check_device(config.device)
     tracker_class(config.tracking)
     learner = find_learner(config.agent)
+    # Before anything else asks for the environment: one of its instances is then tried out for all of them.
+    resume_check = check_resume(config.env)
     about = describe(config.env)
     dims = Dimensions(len(about.observation_names), len(about.action_names))
     teacher = find_teacher(config, dims)
@@ -59,7 +72,17 @@ def prepare(spec: RunSpec) -> Prepared:
     networks, report = transfer(fresh, teacher, config.transfer, config.freeze, streams.networks)
     copied_alpha = teacher is not None and config.transfer.copy_log_alpha
     log_alpha = teacher.description.log_alpha if teacher is not None and copied_alpha else 0.0
-    return Prepared(spec, about, networks, report, learner, log_alpha, streams)
+    return Prepared(
+        spec=spec,
+        about=about,
+        networks=networks,
+        report=report,
+        learner=learner,
+        log_alpha=log_alpha,
+        streams=streams,
+        products=choose_products(config.agent, config.device),
+        resume_check=resume_check,
+    )
 
 
 def find_teacher(config: ExperimentConfig, dims: Dimensions) -> Teacher | None:
@@ -97,45 +120,3 @@ def _check_device(device: str) -> None:
         raise ConfigError(f"device={device}: must be cpu or cuda")
     if kind == "cuda" and not torch.cuda.is_available():
         raise ConfigError(f"device={device}: no CUDA device is available here; type device=cpu")
-
-
-def arrays_bytes(networks: Networks) -> int:
-    """At most this much do the arrays of one checkpoint take: weights, targets, two moments each, and the rest."""
-    return 5 * 4 * networks.architecture.parameter_count + (4 << 20)
-
-
-def space_needed(config: ExperimentConfig, networks: Networks) -> int:
-    """Bytes that a run takes on the disk while it goes on."""
-    weights = 4 * networks.architecture.parameter_count
-    if config.checkpoint_every == 0:
-        return weights + _SMALL
-    dims, agent = networks.dims, config.agent
-    replay = replay_bytes(agent.buffer_size, config.most_steps, dims.observation, dims.action)
-    # One checkpoint more while the oldest is still there; each holds weights, most of their targets, two moments.
-    return replay + (KEPT + 1) * 4 * weights + _SMALL
-
-
-def check_space(config: ExperimentConfig, networks: Networks, run_dir: Path, checkpoint_folder: Path) -> None:
-    """Refuses a run that its disk cannot take.
-
-    Raises:
-        ConfigError: With what it needs and what there is.
-    """
-    place = next((folder for folder in (run_dir, *run_dir.absolute().parents) if folder.is_dir()), Path("/"))
-    needed = space_needed(config, networks)
-    free = shutil.disk_usage(place).free
-    if needed > free + _held(checkpoint_folder):
-        raise ConfigError(
-            f"{run_dir}: takes up to {size(needed)} while it runs, but its disk has {size(free)} free; free some, "
-            "type output_dir=FOLDER on another disk, or checkpoint_every=0 (it cannot be resumed then)"
-        )
-
-
-def _held(folder: Path) -> int:
-    total = 0
-    # Another process may be at work there, and remove what is looked at.
-    with suppress(FileNotFoundError, NotADirectoryError):
-        for path in folder.iterdir():
-            with suppress(FileNotFoundError):
-                total += path.lstat().st_size
-    return total

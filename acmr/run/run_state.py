@@ -7,24 +7,34 @@ entry of a checkpoint in turn and expects another run.
 from __future__ import annotations
 
 import copy
+import shutil
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
 
 import numpy as np
 import torch
 
-from acmr.agent.replay_files import ReplayFiles
+from acmr.agent.networks import Networks
+from acmr.agent.replay_files import ReplayFiles, replay_bytes
+from acmr.config import ConfigError, ExperimentConfig
+from acmr.envs import make_env
 from acmr.envs.physics import PhysicsWarnings
 from acmr.envs.state import RestorableEnv
 from acmr.records import DamagedError
+from acmr.run.preparation import Prepared
 from acmr.run.run_logs import RunLogs
-from acmr.run.trainer import Trainer
+from acmr.run.trainer import Trainer, make_trainer
 from acmr.stateful import State, Stateful
-from acmr.storage.checkpoint_store import Snapshot
-from acmr.text import one_line
+from acmr.storage.checkpoint_store import KEPT, Snapshot
+from acmr.storage.run_dir import RunDir
+from acmr.text import one_line, size
 
+#: Logs, settings and whatever is small, in bytes.
+_SMALL = 1 << 20
 #: What arrays are called in a checkpoint, by the library that they come from and go back to.
 _NUMPY, _TORCH = "numpy", "torch"
 
@@ -115,6 +125,14 @@ class RunState:
             raise DamagedError(f"not the state of this run ({one_line(error)})") from error
 
 
+def make_state(prepared: Prepared, run_dir: RunDir) -> RunState:
+    """Makes the parts of a run as they are before its first step; touches no disk."""
+    env, logs = RestorableEnv(make_env(prepared.spec.config.env)), RunLogs(run_dir, prepared.about)
+    warnings = PhysicsWarnings(env)
+    trainer = make_trainer(prepared, warnings, logs)
+    return RunState(trainer, env, warnings, ReplayFiles(run_dir.checkpoint_folder, trainer.buffer), logs)
+
+
 def split(state: State, path: str = "") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Takes a state apart into what JSON holds and arrays, which are named by their place in it.
 
@@ -162,3 +180,45 @@ def join(values: dict[str, Any], arrays: dict[str, np.ndarray]) -> State:
 def _is_plain(leaf: object) -> bool:
     # The type itself: a NumPy number is a float, too, but would come back as Python's, which rounds differently.
     return type(leaf) in (type(None), bool, int, float, str) or (type(leaf) is list and all(map(_is_plain, leaf)))
+
+
+def arrays_bytes(networks: Networks) -> int:
+    """At most this much do the arrays of one checkpoint take: weights, targets, two moments each, and the rest."""
+    return 5 * 4 * networks.architecture.parameter_count + (4 << 20)
+
+
+def space_needed(config: ExperimentConfig, networks: Networks) -> int:
+    """Bytes that a run takes on the disk while it goes on."""
+    weights = 4 * networks.architecture.parameter_count
+    if config.checkpoint_every == 0:
+        return weights + _SMALL
+    dims, agent = networks.dims, config.agent
+    replay = replay_bytes(agent.buffer_size, config.most_steps, dims.observation, dims.action)
+    # One checkpoint more while the oldest is still there; each holds weights, most of their targets, two moments.
+    return replay + (KEPT + 1) * 4 * weights + _SMALL
+
+
+def check_space(config: ExperimentConfig, networks: Networks, run_dir: Path, checkpoint_folder: Path) -> None:
+    """Refuses a run that its disk cannot take.
+
+    Raises:
+        ConfigError: With what it needs and what there is.
+    """
+    place = next((folder for folder in (run_dir, *run_dir.absolute().parents) if folder.is_dir()), Path("/"))
+    needed = space_needed(config, networks)
+    free = shutil.disk_usage(place).free
+    if needed > free + _held(checkpoint_folder):
+        raise ConfigError(
+            f"{run_dir}: takes up to {size(needed)} while it runs, but its disk has {size(free)} free; free some, "
+            "type output_dir=FOLDER on another disk, or checkpoint_every=0 (it cannot be resumed then)"
+        )
+
+
+def _held(folder: Path) -> int:
+    total = 0
+    # Another process may be at work there, and remove what is looked at.
+    with suppress(FileNotFoundError, NotADirectoryError):
+        for path in folder.iterdir():
+            with suppress(FileNotFoundError):
+                total += path.lstat().st_size
+    return total

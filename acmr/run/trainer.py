@@ -13,8 +13,11 @@ import torch
 
 from acmr.agent.learner import Learner
 from acmr.agent.replay_buffer import ReplayBuffer
+from acmr.config import THRESHOLD
 from acmr.records import EpisodeInProgress
+from acmr.run.preparation import Prepared
 from acmr.run.random_streams import RandomStreams
+from acmr.run.run_logs import RunLogs
 from acmr.stateful import State
 from acmr.tracking.observer import Observer
 
@@ -165,3 +168,27 @@ def is_finite(agent: Learner) -> bool:
 def _all_finite(tensor: torch.Tensor) -> bool:
     # As with the trainer's checks: a finite sum has finite terms, and is quicker to come by.
     return math.isfinite(float(tensor.sum())) or bool(torch.isfinite(tensor).all())
+
+
+def make_trainer(prepared: Prepared, env: gym.Env[np.ndarray, np.ndarray], logs: RunLogs) -> Trainer:
+    """Makes the trainer of a run as it is before its first step.
+
+    Args:
+        prepared: What the run starts with.
+        env: The environment to step.
+        logs: Hold the returns by which a run may stop at its threshold.
+    """
+    config, streams, about = prepared.spec.config, prepared.streams, prepared.about
+    dims = prepared.networks.dims
+    return Trainer(
+        env=env,
+        agent=prepared.learner(
+            prepared.networks, config.agent, streams.acting, streams.learning, prepared.log_alpha, config.device
+        ),
+        buffer=ReplayBuffer(config.agent.buffer_size, dims.observation, dims.action, config.device),
+        streams=streams,
+        total_timesteps=config.most_steps,
+        log_every=config.log_every,
+        episode=EpisodeInProgress(about.reward_terms, about.has_forward_velocity),
+        is_satisfied=lambda: config.stop == THRESHOLD and logs.meet(config.threshold, config.consecutive),
+    )
