@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -165,8 +167,18 @@ def test_a_disk_that_refuses_a_row_ends_the_run_and_closes_all(tmp_path: Path) -
     ended = run(prepare)
     assert ended.code == 74, ended.said
     assert "free some space there" in ended.said
-    assert heard(run)[-1] == ["close", None]
+    told = heard(run)
+    assert told[-1] == ["close", None]
+    # What is not in the run's own record is shown nowhere.
+    recorded = (run.folder / "episodes.csv").read_text().splitlines()[1:]
+    assert [entry[1] for entry in told if entry[0] == "episode"] == [int(row.split(",")[0]) for row in recorded]
     assert json.loads((run.folder / "status.json").read_text())["state"] == "stopped"
+
+
+def test_a_run_that_is_stopped_has_shown_its_last_step(tmp_path: Path) -> None:
+    run = Run(tmp_path, tracked_by(Remembering))
+    assert run(at_step(123, lambda: os.kill(os.getpid(), signal.SIGTERM))).code == 143
+    assert heard(run)[-2:] == [["step", 123], ["close", None]]
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,8 @@ from tracking_tools import child
 from acmr.settings.compose import compose_config, options, parse
 from acmr.tracking.mirror import main
 from acmr.tracking.watchers import tracker_class
+from analysis.loading.load import load
+from analysis.publish import publish
 
 TENSORBOARD = (*(word for word in ANT if word != "tracking=off"), "tracking=tensorboard")
 Scalars = dict[str, list[tuple[int, float]]]
@@ -53,6 +55,9 @@ def test_a_killed_run_loses_no_event_and_a_resumed_one_has_none_twice(tmp_path: 
     assert run(at_step(245)).code == -signal.SIGKILL
     assert "critic_loss" in events(run.folder)
     same_scalars(run.folder)
+    (file,) = (run.folder / "tensorboard").iterdir()
+    # As if some time had passed: files are named by the second.
+    file.rename(file.with_name("events.out.tfevents.1.here"))
     # The checkpoint is of step 240: rows of later steps are written again.
     assert run().code == 0
     same_scalars(run.folder)
@@ -68,6 +73,11 @@ def test_events_are_rebuilt_from_the_runs_own_files(tmp_path: Path) -> None:
     assert main(["rebuild", "--tracking", "tensorboard", str(run.folder)]) == 0
     same_scalars(run.folder)
     assert not (tmp_path / "wandb").exists()
+    # Neither the analysis nor what is published takes them for results.
+    runs = run.folder.parent.parent
+    assert list(load(runs).runs.index) == [str(run.folder.relative_to(runs))]
+    ((published,), _) = publish(runs, tmp_path / "published")
+    assert "tensorboard" not in {path.name for path in published.iterdir()}
 
 
 def test_without_the_library_one_line_says_what_to_install(tmp_path: Path) -> None:
