@@ -15,7 +15,7 @@ from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 
 from acmr.config import EnvConfig
 from acmr.envs import check_resume, describe, make_env
-from acmr.envs.state import ANYTIME, BETWEEN_EPISODES, NEVER, rehearse
+from acmr.envs.state import ANYTIME, BETWEEN_EPISODES, NEVER, try_resume
 from acmr.settings.compose import environment_config
 
 #: Runs the command line that follows, and counts calls of gymnasium.make until the trainer starts.
@@ -81,7 +81,7 @@ def test_the_check_sees_the_same_with_an_instance_that_was_tried_out(name: str) 
     config = environment_config(name)
     checked = check_resume(config)
     assert checked.when == ANYTIME
-    assert checked == rehearse(lambda: make_env(config))
+    assert checked == try_resume(lambda: make_env(config))
 
 
 class Smooth(HopperEnv):
@@ -126,4 +126,4 @@ def test_only_new_instances_show_what_is_made_in_a_first_step(env_id: str, when:
             env.step(np.zeros(3, np.float32))
         return env
 
-    assert rehearse(used).when == ANYTIME
+    assert try_resume(used).when == ANYTIME

@@ -15,7 +15,7 @@ from torture import ANT, HUMANOID, SMALL, Run, at_step, same
 from acmr.storage.checkpoint_store import Snapshot, SnapshotStore
 
 PENDULUM = ("env=gym", "env.id=Pendulum-v1", "env.max_episode_steps=30", "total_timesteps=220", *SMALL)
-KINDS = {"humanoid": HUMANOID, "ant": ANT, "pendulum": PENDULUM}
+KINDS = {"humanoid": HUMANOID, "ant": ANT, "pendulum": PENDULUM, "plain": (*ANT, "agent=sac_plain")}
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +50,7 @@ def stopped(tmp_path) -> Run:
         ("humanoid", [160, 161, 290], [120, 160, 280]),  # on a checkpoint's step; after the ring has wrapped
         ("ant", [90, 91, 299], [80, 80, 280]),  # the step at which the time limit ends an episode; the last step
         ("pendulum", [75, 200], [60, 180]),  # checkpoints at the ends of episodes only
+        ("plain", [54, 130], [40, 120]),  # the learner whose state is that of torch's own networks and optimizers
     ],
 )
 def test_kills_leave_no_trace(kind, kills, resumed, untouched, tmp_path):

@@ -11,7 +11,7 @@ from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from acmr.config import EnvConfig
 from acmr.envs import make_env
 from acmr.envs.physics import PhysicsWarnings
-from acmr.envs.state import ANYTIME, BETWEEN_EPISODES, NEVER, RestorableEnv, capture, data_arrays, rehearse, restore
+from acmr.envs.state import ANYTIME, BETWEEN_EPISODES, NEVER, RestorableEnv, capture, data_arrays, restore, try_resume
 from acmr.settings.compose import environment_config
 from acmr.stateful import State
 
@@ -110,7 +110,7 @@ def test_dropped_sensors_and_actuators():
     actions = actions_for(env, 60)
     play(env, actions[:9])
     assert same(play(twin(config, capture(env, True)), actions[9:]), play(env, actions[9:]))
-    assert rehearse(lambda: make_env(config)).when == ANYTIME
+    assert try_resume(lambda: make_env(config)).when == ANYTIME
 
 
 @pytest.mark.parametrize("name", ["humanoid", "Pendulum-v1", "MountainCarContinuous-v0"])
@@ -246,11 +246,11 @@ gym.register("AcmrCountedPendulum-v0", lambda **kwargs: Counted(PendulumEnv(**kw
         ("AcmrCountedPendulum-v0", BETWEEN_EPISODES),
     ],
 )
-def test_a_rehearsal_finds_out_when_an_environment_can_be_stored(name, when):
+def test_a_check_finds_out_when_an_environment_can_be_stored(name, when):
     config = environment_config(name)
-    seen = rehearse(lambda: make_env(config))
+    seen = try_resume(lambda: make_env(config))
     assert seen.when == when
-    assert seen.trace == rehearse(lambda: make_env(config)).trace
+    assert seen.trace == try_resume(lambda: make_env(config)).trace
 
 
 def test_a_state_that_does_not_fit_is_refused():

@@ -49,10 +49,10 @@ def put(values: dict[str, Any], path: str, fresh: dict[str, Any]) -> None:
         target.pop(name, None)
 
 
-@pytest.fixture(scope="module", params=["ant", "humanoid"])
+@pytest.fixture(scope="module", params=["ant", "humanoid", "plain"])
 def base(request, tmp_path_factory) -> tuple[Run, dict[int, dict[str, bytes]], Snapshot]:
     """A run killed at step 130, what it comes to from each of its checkpoints, and the state of a fresh one."""
-    overrides = {"ant": ANT, "humanoid": HUMANOID}[request.param]
+    overrides = {"ant": ANT, "humanoid": HUMANOID, "plain": (*ANT, "agent=sac_plain")}[request.param]
     overrides = (*overrides, "total_timesteps=210")
     folder = tmp_path_factory.mktemp(request.param)
     run = Run(folder / "base", overrides)

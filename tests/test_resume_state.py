@@ -16,7 +16,7 @@ from safetensors.numpy import load, save
 from torture import ANT, Run, at_step
 
 from acmr.envs import make_env
-from acmr.envs.state import NEVER, RestorableEnv, rehearse
+from acmr.envs.state import NEVER, RestorableEnv, try_resume
 from acmr.run.run_state import RunState, join, split
 from acmr.settings.compose import environment_config
 
@@ -149,4 +149,4 @@ def test_a_part_that_is_forgotten_is_noticed_before_the_first_step(spoiled, tmp_
     (tmp_path / f"{name}.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     config = environment_config(f"{name}:{name}-v0")
-    assert rehearse(lambda: make_env(config)).when == NEVER
+    assert try_resume(lambda: make_env(config)).when == NEVER

@@ -19,7 +19,7 @@ from gymnasium.spaces import Box
 from acmr.config import EnvConfig
 from acmr.envs.construct import cannot_run, construct
 from acmr.envs.naming import part_names, probe
-from acmr.envs.state import ResumeCheck, rehearse
+from acmr.envs.state import ResumeCheck, try_resume
 from acmr.envs.wrappers import PartialEnv, kept_rows
 from acmr.records import VELOCITY_KEY
 
@@ -106,7 +106,7 @@ def check_resume(config: EnvConfig) -> ResumeCheck:
         ConfigError: As :func:`make_env`.
     """
     whole, env = _tried(config)
-    return rehearse(lambda: make_env(config), _with_kept(config, whole, env))
+    return try_resume(lambda: make_env(config), _with_kept(config, whole, env))
 
 
 def _try_out(config: EnvConfig) -> EnvDescription:

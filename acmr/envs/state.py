@@ -173,7 +173,7 @@ class ResumeCheck:
     trace: bytes
 
 
-def rehearse(make: Callable[[], Env], first: Env | None = None) -> ResumeCheck:
+def try_resume(make: Callable[[], Env], first: Env | None = None) -> ResumeCheck:
     """Captures the state of one instance, puts another into it, and compares what both do next.
 
     Args:

@@ -31,7 +31,7 @@ def fingerprint(threads: int, device: str, environment_trace: bytes) -> dict[str
     Args:
         threads: Threads that the learner computes with.
         device: Where it computes.
-        environment_trace: What the environment returned in a rehearsal.
+        environment_trace: What the environment returned while its resuming was checked.
     """
     found = versions()
     where = machine(threads, device)
