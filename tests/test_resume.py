@@ -97,13 +97,14 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(stopped, untouched):
     same(stopped.finish(), untouched(ANT)[0])
 
 
-@pytest.mark.parametrize("damage", ["both", "segment", "episodes.csv"])
+@pytest.mark.parametrize("damage", ["both", "segment", "episodes.csv", "metrics.csv"])
 def test_two_damaged_checkpoints_are_refused_and_nothing_is_changed(damage, stopped, untouched):
     folder = stopped.folder / "checkpoint"
     files = {
         "both": [folder / "step_80.safetensors", folder / "step_120.json"],
         "segment": [folder / "segment_0_40.safetensors"],
         "episodes.csv": [stopped.folder / "episodes.csv"],
+        "metrics.csv": [stopped.folder / "metrics.csv"],
     }[damage]
     for path in files:
         path.write_bytes(path.read_bytes()[:40])
