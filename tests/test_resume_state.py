@@ -17,8 +17,10 @@ from torture import ANT, Run, at_step
 
 from acmr.envs import make_env
 from acmr.envs.state import NEVER, RestorableEnv, try_resume
-from acmr.run.run_state import RunState, join, split
+from acmr.run.run_state import RunState
 from acmr.settings.compose import environment_config
+from acmr.storage.checkpoint_store import Snapshot, SnapshotStore
+from acmr.storage.state_data import join, split
 
 GUIDE = ROOT / "docs" / "howto-state.md"
 
@@ -75,11 +77,23 @@ def test_what_a_file_would_change_is_refused_with_its_place(wrong, place):
         split(wrong)
 
 
+@pytest.mark.parametrize(
+    "snapshot", [Snapshot({}, {"a": np.zeros(1000)}), Snapshot({"a": "x" * 70_000_000}, {})], ids=["arrays", "values"]
+)
+def test_a_checkpoint_that_would_not_be_read_again_is_not_made(snapshot, tmp_path):
+    store = SnapshotStore(tmp_path, limit=1000)
+    with pytest.raises(ValueError, match="would be read again"):
+        store.write(7, snapshot)
+    assert store.steps() == []
+
+
 class Tally:
     """A part that nobody foresaw: it counts the steps, and writes each count to a file."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.state = path, {"steps": 0, "sum": np.zeros(2, np.float32), "tensor": torch.zeros(1)}
+        # Larger than all else in a checkpoint of so small a run.
+        self.state["large"] = np.zeros(1_000_000)
 
     def step(self) -> None:
         self.state["steps"] += 1

@@ -220,7 +220,7 @@ class CheckpointSchedule(Observer):
         self._checkpoints, self._trainer, self._stop, self._say = checkpoints, state.trainer, stop, say
         every, when = prepared.spec.config.checkpoint_every, prepared.resume_check.when
         if when != ANYTIME and every != 0:
-            made = "not be stored: no checkpoints are made, and a run that was stopped begins anew"
+            made = "not be stored (docs/howto-state.md): no checkpoints are made, a run that was stopped begins anew"
             if when != NEVER:
                 made = "be stored between episodes only: checkpoints wait for the end of one"
             say(f"{prepared.spec.directory}: the state of {prepared.spec.config.env.name} can {made}")

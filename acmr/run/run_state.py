@@ -6,17 +6,11 @@ entry of a checkpoint in turn and expects another run.
 
 from __future__ import annotations
 
-import copy
 import shutil
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-from urllib.parse import quote, unquote
-
-import numpy as np
-import torch
 
 from acmr.agent.networks import Networks
 from acmr.agent.replay_files import ReplayFiles, replay_bytes
@@ -31,12 +25,13 @@ from acmr.run.trainer import Trainer, make_trainer
 from acmr.stateful import State, Stateful
 from acmr.storage.checkpoint_store import KEPT, Snapshot
 from acmr.storage.run_dir import RunDir
+from acmr.storage.state_data import join, split
 from acmr.text import one_line, size
 
 #: Logs, settings and whatever is small, in bytes.
 _SMALL = 1 << 20
-#: What arrays are called in a checkpoint, by the library that they come from and go back to.
-_NUMPY, _TORCH = "numpy", "torch"
+#: Bytes that the arrays of all parts but the learner may take in a checkpoint.
+_OTHER_ARRAYS = 256 << 20
 
 
 class Clock:
@@ -133,58 +128,12 @@ def make_state(prepared: Prepared, run_dir: RunDir) -> RunState:
     return RunState(trainer, env, warnings, ReplayFiles(run_dir.checkpoint_folder, trainer.buffer), logs)
 
 
-def split(state: State, path: str = "") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Takes a state apart into what JSON holds and arrays, which are named by their place in it.
-
-    Raises:
-        TypeError: If it holds anything that a file would not give back as it is.
-    """
-    values: dict[str, Any] = {}
-    arrays: dict[str, np.ndarray] = {}
-    for key, leaf in state.items():
-        if type(key) is not str:
-            raise TypeError(f"state{path}: the key {key!r} is no text")
-        # Quoted, for a name may hold the slash that parts names.
-        place = f"{path}/{quote(key, safe='')}"
-        if isinstance(leaf, dict):
-            values[key], inner = split(leaf, place)
-            arrays |= inner
-        elif isinstance(leaf, np.ndarray) and leaf.dtype.kind in "biuf":
-            arrays[_NUMPY + place] = leaf
-        elif isinstance(leaf, torch.Tensor):
-            arrays[_TORCH + place] = leaf.detach().cpu().numpy()
-        elif _is_plain(leaf):
-            values[key] = leaf
-        else:
-            raise TypeError(
-                f"state{place}: a {type(leaf).__name__} cannot be stored; give a number, a text or an array"
-            )
-    return values, arrays
-
-
-def join(values: dict[str, Any], arrays: dict[str, np.ndarray]) -> State:
-    """Reverses :func:`split`; every array is a copy."""
-    state = copy.deepcopy(values)
-    for name, array in arrays.items():
-        kind, *groups, last = (unquote(part) for part in name.split("/"))
-        group = state
-        for inner in groups:
-            group = group[inner]
-        if last in group:
-            raise ValueError(f"two values at {name}")
-        # What was read from a file cannot be written to, and parts do write to it.
-        group[last] = torch.from_numpy(array.copy()) if kind == _TORCH else array.copy()
-    return state
-
-
-def _is_plain(leaf: object) -> bool:
-    # The type itself: a NumPy number is a float, too, but would come back as Python's, which rounds differently.
-    return type(leaf) in (type(None), bool, int, float, str) or (type(leaf) is list and all(map(_is_plain, leaf)))
-
-
 def arrays_bytes(networks: Networks) -> int:
-    """At most this much do the arrays of one checkpoint take: weights, targets, two moments each, and the rest."""
-    return 5 * 4 * networks.architecture.parameter_count + (4 << 20)
+    """At most this much do the arrays of one checkpoint take: weights, targets, two moments each, and the rest.
+
+    A checkpoint whose arrays are larger is not read, so that somebody else's cannot fill the memory.
+    """
+    return 5 * 4 * networks.architecture.parameter_count + _OTHER_ARRAYS
 
 
 def space_needed(config: ExperimentConfig, networks: Networks) -> int:

@@ -32,6 +32,7 @@ from acmr.storage.durable import (
     sync_folder,
     write_bytes,
 )
+from acmr.text import size
 
 #: Changes with what a checkpoint holds and where; another one is refused.
 FORMAT_VERSION = 2
@@ -39,6 +40,8 @@ FORMAT_VERSION = 2
 KEPT = 2
 #: A state larger than this is not one of ours.
 _MAX_STATE_BYTES = 64 << 20
+#: More than the first line of a state file takes.
+_HEAD_BYTES = 1024
 _STATE = re.compile(r"step_(\d{1,15})\.json")
 _OURS = re.compile(r"(step_\d{1,15}\.(json|safetensors)|segment_\d{1,15}_\d{1,15}\.safetensors)")
 
@@ -88,11 +91,18 @@ class SnapshotStore:
         remove_leftovers(self.folder)
 
     def write(self, step: int, snapshot: Snapshot) -> None:
-        """Adds a checkpoint; other files that its state names must be on the disk."""
+        """Adds a checkpoint; other files that its state names must be on the disk.
+
+        Raises:
+            ValueError: If it is larger than what would be read again.
+            WriteError: If the disk does not take it.
+        """
         data = save_arrays(snapshot.arrays)
+        _check_size("arrays", data, self._limit)
         write_bytes(self._arrays_file(step), data)
         content = {"values": snapshot.values, "arrays": FileDigest.of(data).to_json()}
         body = (json.dumps(content) + "\n").encode()
+        _check_size("values", body, _MAX_STATE_BYTES - _HEAD_BYTES)
         # Last: a checkpoint exists once this file does, and all that it needs is there by then.
         write_bytes(self.state_file(step), _head(body) + b"\n" + body)
 
@@ -166,6 +176,12 @@ class SnapshotStore:
 
 def _head(body: bytes) -> bytes:
     return json.dumps({"format_version": FORMAT_VERSION, "sha256": hashlib.sha256(body).hexdigest()}).encode()
+
+
+def _check_size(what: str, data: bytes, limit: int) -> None:
+    # Now rather than when it is to be read: until then the run would take it for a good one.
+    if len(data) > limit:
+        raise ValueError(f"a checkpoint with {what} of {size(len(data))}; at most {size(limit)} would be read again")
 
 
 def _not_as_written(path: Path, head: bytes) -> DamagedError:
