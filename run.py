@@ -19,6 +19,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from acmr.command import command
 from acmr.settings.compose import parse, register_schema
 from acmr.settings.errors import USER_ERRORS, check_booleans, explain, quote_paths
 from acmr.settings.run_spec import RunSpec, specify
@@ -66,6 +67,7 @@ def _arguments(given: list[str]) -> list[str]:
     return ["--multirun", *arguments] if several else arguments
 
 
+@command
 def main() -> int:
     """Runs the command line; returns the exit code."""
     if len(sys.argv) == 2 and sys.argv[1].startswith("@"):
@@ -80,9 +82,6 @@ def _exit_code(run: Callable[[], None]) -> int:
     except USER_ERRORS as error:
         print(f"error: {explain(error)}", file=sys.stderr)
         return int(getattr(error, "exit_code", 2))
-    except KeyboardInterrupt:
-        print("stopped; the same command starts this run again", file=sys.stderr)
-        return 130
     return 0
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
 from acmr.cells import REFERENCE
+from acmr.command import command
 from analysis import FORMATS
 
 
@@ -19,6 +19,7 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"analysis: {message} (python -m analysis --help)\n")
 
 
+@command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the analysis.
 
@@ -37,13 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run(options)
     except InputError as error:
         print(f"analysis: {error}", file=sys.stderr)
-    except BrokenPipeError:  # whoever read the output has closed it, as in "| head"
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
     except OSError as error:
         print(f"analysis: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
-    except KeyboardInterrupt:
-        return 130
     return 2
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from acmr.cells import CELLS
+from acmr.command import command
 from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
@@ -112,6 +113,7 @@ def _report(added: list[Path], there: list[Path]) -> Iterator[str]:
         yield f"is there {run}"
 
 
+@command
 def main() -> int:
     """Entry of ``python -m analysis.publish``."""
     parser = argparse.ArgumentParser(prog="python -m analysis.publish", description="Finished runs, to be committed.")

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from acmr.command import command
 from acmr.records import CONFIG_FILE, RUN_PATTERN, RUNNING, SEED_FOLDER, STATUS_FILE
 from acmr.text import duration
 from sweeps.folder import FAILED, WAITING, State, SweepFolder, SweepRun, all_folders
@@ -57,6 +58,7 @@ def _seed(directory: Path) -> int:
     return int(match[1]) if match else 0
 
 
+@command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints the table; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m sweeps.status", description=__doc__)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from acmr.command import command
 from acmr.config import ConfigError
 from acmr.records import COMPLETE, ENDED, RUNNING, STOPPED
 from acmr.storage.run_dir import RunDir
@@ -172,6 +173,7 @@ def _reason(code: int, words: str) -> str:
     return words or f"exit code {code}"
 
 
+@command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains runs of a sweep until none is left that could start; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m sweeps.worker", description=main.__doc__)

@@ -108,6 +108,27 @@ def test_a_guarded_observer_fails_once_and_is_closed(method: str) -> None:
     assert inner.calls.count("close") == 1
 
 
+def test_an_observer_whose_failure_cannot_even_be_said_ends_no_run() -> None:
+    def say(line: str) -> None:
+        raise BrokenPipeError(line)
+
+    inner = Failed("on_step")
+    Guarded(inner, say).on_step(10)
+    assert inner.calls == ["on_step", "close"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, OSError])
+def test_all_are_closed_whatever_one_of_them_raises(error: type[BaseException]) -> None:
+    class Interrupted(Observer):
+        def close(self, summary: Any) -> None:
+            raise error
+
+    after = Failed("on_step")
+    with pytest.raises(error):
+        close_all([Interrupted(), after], None)
+    assert after.calls == ["close"]
+
+
 def test_all_are_closed_and_the_first_error_is_raised() -> None:
     observers = [Failed("on_step"), Failed("close"), Failed("close"), Failed("on_step")]
     with pytest.raises(ValueError, match="close failed") as caught:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Iterator
 
+from acmr.command import command
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs import describe
 from acmr.envs.construct import find_spec, gym_ids
@@ -49,6 +49,7 @@ def details(name: str) -> Iterator[str]:
         yield f"action      {index:>4}  {label}  [{about.action_low[index]:g}, {about.action_high[index]:g}]"
 
 
+@command
 def main() -> int:
     """Runs the command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m acmr.envs", description=__doc__)
@@ -57,13 +58,9 @@ def main() -> int:
     try:
         for line in overview() if name is None else details(name):
             print(line)
-        sys.stdout.flush()
     except USER_ERRORS as error:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2
-    except BrokenPipeError:
-        # Whoever read this (head, less) has seen enough; Python would complain again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 

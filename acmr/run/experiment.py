@@ -20,6 +20,7 @@ from acmr.run.trainer import DivergedError, Trainer
 from acmr.settings.run_spec import RunSpec
 from acmr.storage.durable import StorageError, WriteError
 from acmr.storage.run_dir import RunDir, RunHeldError, holds_run
+from acmr.text import one_line
 from acmr.tracking.observer import close_all
 from acmr.tracking.watchers import make_watchers
 from acmr.transfer.teacher import save_teacher
@@ -101,8 +102,7 @@ class Session:
         except WriteError as error:
             raise StorageError(self.run_dir.path, error, checkpoints.latest) from error
         finally:
-            state.logs.close()
-            state.trainer.env.close()
+            self._close(state)
 
     def _start(self, checkpoints: Checkpoints, state: RunState) -> None:
         spec, run_dir, trainer = self.prepared.spec, self.run_dir, state.trainer
@@ -151,6 +151,15 @@ class Session:
             speed = f"{summary['steps_per_second']:.0f} steps per second"
             self.say(f"{run_dir}: complete, {speed}{reached(summary)}")
         return summary
+
+    def _close(self, state: RunState) -> None:
+        try:
+            state.trainer.env.close()
+        except Exception as error:
+            # The run is what it is; whether its environment could be closed is no part of it.
+            self.say(f"warning: the environment could not be closed ({one_line(error)})")
+        finally:
+            state.logs.close()
 
     def _remove(self, checkpoints: Checkpoints) -> None:
         try:

@@ -58,13 +58,19 @@ def explain(error: BaseException) -> str:
 
 def quote_paths(arguments: Sequence[str]) -> list[str]:
     """The command line with every path quoted as Hydra's grammar needs it."""
-    quoted = []
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key.lstrip("+") in PATH_KEYS and "=" in value and not value.startswith(("'", '"')):
-            argument = f"{key}={as_override(value)}"
-        quoted.append(argument)
-    return quoted
+    return [_quoted(each) if each.partition("=")[0].lstrip("+") in PATH_KEYS else each for each in arguments]
+
+
+def _quoted(argument: str) -> str:
+    key, _, value = argument.partition("=")
+    if value.startswith(("'", '"')):
+        return argument
+    try:
+        OverridesParser.create().parse_overrides([argument])
+    except OverrideParseException:
+        # An equal sign, as in names of runs, or a letter that is not English.
+        return f"{key}={as_override(value)}"
+    return argument
 
 
 def check_booleans(overrides: Sequence[str]) -> None:

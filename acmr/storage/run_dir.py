@@ -130,8 +130,9 @@ class RunDir:
 
         def both(line: str) -> None:
             with suppress(OSError):
-                os.write(descriptor, f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n".encode())
-            with suppress(OSError):
+                # A path may hold bytes that are no text.
+                os.write(descriptor, f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n".encode(errors="replace"))
+            with suppress(OSError, ValueError):
                 say(line)
 
         descriptor = self._open(self.log_file, os.O_WRONLY | os.O_APPEND)

@@ -17,6 +17,7 @@ from typing import Any
 
 import yaml
 
+from acmr.command import command
 from acmr.config import ConfigError
 from acmr.records import CONFIG_FILE, SUMMARY_FILE
 from acmr.settings.compose import compose_config, options, parse, stored_config
@@ -109,6 +110,7 @@ def dashboard(folder: Path) -> None:
     os.execv(sys.executable, [sys.executable, "-m", "wandb", "leet", str(links)])
 
 
+@command
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m acmr.tracking.mirror", description=__doc__)

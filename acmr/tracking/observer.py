@@ -113,16 +113,20 @@ class Guarded(Observer):
         self._observer = Observer()
 
     def _warn(self, error: Exception) -> None:
-        self._say(f"{self._observer.title} stopped: {one_line(error)}. The run goes on; its own files are complete.")
+        line = f"{self._observer.title} stopped: {one_line(error)}. The run goes on; its own files are complete."
+        # Where even that cannot be said, the run goes on in silence.
+        with suppress(Exception):
+            self._say(line)
 
 
 def close_all(observers: Iterable[Observer], summary: Mapping[str, Any] | None) -> None:
     """Closes every observer, in their order, whatever happens to the others; raises the first error there was."""
-    errors = []
+    errors: list[BaseException] = []
     for observer in observers:
         try:
             observer.close(summary)
-        except Exception as error:
+        # A second Ctrl-C, too, must not keep the others from being closed.
+        except BaseException as error:
             errors.append(error)
     if errors:
         raise errors[0]

@@ -1,0 +1,99 @@
+"""What every command of the project begins with: nothing that it prints can end it, and Ctrl-C ends it in one line.
+
+The standard library only, so that it is there before anything that takes long to load.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import select
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from functools import wraps
+from typing import TYPE_CHECKING, ParamSpec
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
+_Arguments = ParamSpec("_Arguments")
+#: The exit code after Ctrl-C.
+INTERRUPTED = 130
+
+
+def command(main: Callable[_Arguments, int]) -> Callable[_Arguments, int]:
+    """Makes a function the whole of a program: with streams that never fail, and an end in one line after Ctrl-C.
+
+    Args:
+        main: Returns the exit code.
+    """
+
+    @wraps(main)
+    def run(*arguments: _Arguments.args, **more: _Arguments.kwargs) -> int:
+        protect_streams()
+        try:
+            return main(*arguments, **more)
+        except KeyboardInterrupt:
+            print("stopped by Ctrl-C; the same command starts it again", file=sys.stderr)
+            return INTERRUPTED
+
+    return run
+
+
+def open_closed_streams() -> None:
+    """Puts the null device in the place of each standard stream that was closed before the program started."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            # Else the next file that is opened, a checkpoint for instance, has this number, and what a library in C
+            # writes to standard error lands in it. This is the lowest number that is free, so it is the one we get.
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+        if getattr(sys, name) is None:
+            stream = open(number, "w" if number else "r", encoding="utf-8", closefd=False)  # noqa: SIM115
+            setattr(sys, name, stream)
+            setattr(sys, f"__{name}__", stream)
+
+
+def protect_streams() -> None:
+    """Lets standard output and standard error lose what nobody can take, in place of ending the program.
+
+    A reader that has gone (``| head``), a full disk, a terminal that was closed, a character that the terminal's
+    encoding lacks: what is printed is for people, and no work depends on it. Libraries print through the same streams.
+    Streams that something else has put in their places, a notebook for instance, stay as they are.
+    """
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name)
+        if stream is getattr(sys, f"__{name}__") and isinstance(stream, io.TextIOWrapper):
+            stream = _protected(number, stream)
+            setattr(sys, name, stream)
+            setattr(sys, f"__{name}__", stream)
+
+
+def _protected(number: int, stream: io.TextIOWrapper) -> io.TextIOWrapper:
+    with suppress(OSError):
+        stream.flush()
+    raw = _Lossy(number, "wb", closefd=False)
+    # As Python itself does it: without a buffer where it was started with -u.
+    buffer = raw if stream.write_through else io.BufferedWriter(raw)
+    return io.TextIOWrapper(
+        buffer, stream.encoding, "replace", line_buffering=stream.line_buffering, write_through=stream.write_through
+    )
+
+
+class _Lossy(io.FileIO):
+    """A stream that takes whatever is written to it; what cannot be passed on is lost."""
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        """Writes all of it, if that is possible."""
+        rest = memoryview(data)
+        size = len(rest)
+        with suppress(OSError):
+            while rest:
+                written = super().write(rest)
+                if written is None:
+                    # Somebody who shares the stream has made it one that does not wait.
+                    select.select([], [self], [])
+                rest = rest[written or 0 :]
+        return size
