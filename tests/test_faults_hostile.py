@@ -177,7 +177,7 @@ def test_a_checkpoint_that_names_other_files_is_refused(name, stopped):
         ("replay", {"segments": {"segment_40_40.safetensors": [8, "0"]}}),
         ("trainer", {"global_step": "x"}), ("trainer", {"global_step": None}), ("episode", []), ("agent", {}),
         ("episode", {"length": 1, "total": 0.0, "distance": 0.0, "sums": {"other": 0.0}}),
-        ("environment", {"in_episode": False, "random": {"bit_generator": "MT19937"}}), ("environment", 7),
+        ("environment", {"random": {"bit_generator": "MT19937"}}), ("environment", 7),
         ("logs", {"episodes": [10**15, "0"]}), ("logs", {"episodes": [-1, "0"], "metrics": ["0", 0]}),
         ("streams", {"replay": {"bit_generator": "PCG64", "state": {"state": -1, "inc": 0}}}), ("clock", {}),
         ("warnings", {"counts": 3}), ("something_else", {}),
@@ -201,7 +201,7 @@ def test_arrays_that_do_not_fit_are_refused(stopped):
     snapshot = store.read(80)
     names = (
         "torch/agent/tensors/actor", "numpy/agent/tensors/actor", "numpy/trainer/observation", "numpy/trainer", "numpy",
-        "numpy/environment/robot/data/xipos", "numpy/nobody/x", "numpy/environment/in_episode/x",
+        "numpy/environment/robot/data/xipos", "numpy/nobody/x", "numpy/environment/random/bit_generator/x",
     )  # fmt: skip
     for name in names:
         store.write(80, Snapshot(snapshot.values, snapshot.arrays | {name: np.zeros(3)}))

@@ -1,16 +1,13 @@
 """An environment's state: captured, put into another instance, and the same from there on in every number."""
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
-from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 
 from acmr.config import EnvConfig
 from acmr.envs import make_env
-from acmr.envs.physics import PhysicsWarnings
 from acmr.envs.state import ANYTIME, BETWEEN_EPISODES, NEVER, RestorableEnv, capture, data_arrays, restore, try_resume
 from acmr.settings.compose import environment_config
 from acmr.stateful import State
@@ -62,7 +59,7 @@ def test_every_robot_goes_on_exactly_from_any_step(name):
     actions = actions_for(env, 90)
     play(env, actions[:7])
     for first in (7, 30):
-        state = capture(env, in_episode=True)
+        state = capture(env, whole=True)
         other = twin(config, state)
         arrays = {array: getattr(env.unwrapped.data, array).copy() for array in data_arrays(env.unwrapped.model)}
         for array, content in arrays.items():
@@ -77,7 +74,7 @@ def test_mujocos_own_state_alone_gives_wrong_rewards():
     env.reset(seed=1)
     actions = actions_for(env, 12)
     play(env, actions[:8])
-    whole = capture(env, in_episode=True)
+    whole = capture(env, whole=True)
     fresh = make_env(config)
     fresh.reset(seed=99)
     stale = {name: getattr(fresh.unwrapped.data, name).copy() for name in data_arrays(fresh.unwrapped.model)}
@@ -120,27 +117,22 @@ def test_between_episodes_the_random_numbers_are_enough(name):
     env.reset(seed=1)
     actions = actions_for(env, 60)
     play(env, actions[:9])
-    other = twin(config, capture(env, in_episode=False))
+    other = twin(config, capture(env, whole=False))
     np.testing.assert_array_equal(other.reset()[0], env.reset()[0])
     assert same(play(other, actions), play(env, actions))
 
 
-@pytest.mark.parametrize("name", ["humanoid", "Pendulum-v1"])
-def test_it_knows_by_itself_whether_an_episode_is_under_way(name):
+@pytest.mark.parametrize(("name", "whole"), [("humanoid", True), ("humanoid", False), ("Pendulum-v1", False)])
+def test_the_state_between_two_episodes_is_that_of_the_next_one(name, whole):
     config = environment_config(name)
     config.max_episode_steps = 12
-    env, actions = RestorableEnv(make_env(config)), actions_for(make_env(config), 40)
-    other = RestorableEnv(make_env(config))
+    env, actions = RestorableEnv(make_env(config), whole), actions_for(make_env(config), 40)
+    other = RestorableEnv(make_env(config), whole)
     env.reset(seed=1)
-    assert env.state_dict()["in_episode"]
-    ended = False
-    for action in actions[:12]:
-        if not ended:
-            ended = any(env.step(action)[2:4])
+    any(any(env.step(action)[2:4]) for action in actions[:12])
     state = env.state_dict()
-    assert set(state) == {"in_episode", "random", "layers"}
+    assert set(state) == {"random", "layers", *(("elapsed_steps", "robot") if whole else ())}
     other.load_state_dict(state)
-    assert not other.state_dict()["in_episode"]
     np.testing.assert_array_equal(other.reset()[0], env.reset()[0])
     assert same(play(other, actions), play(env, actions))
 
@@ -190,6 +182,20 @@ class Growing(Hiding):
         return observation
 
 
+class Collecting(HopperEnv):
+    """Keeps an array that grows with each step and fits into no new instance."""
+
+    def step(self, action):
+        result = super().step(action)
+        self.heights = np.append(self.heights, result[0][0])
+        return result
+
+    def reset_model(self):
+        self.heights = np.zeros(1)
+        return super().reset_model()
+
+
+gym.register("AcmrCollecting-v0", Collecting, max_episode_steps=50)
 gym.register("AcmrTiring-v0", Tiring, max_episode_steps=50)
 gym.register("AcmrHiding-v0", Hiding, max_episode_steps=50)
 gym.register("AcmrGrowing-v0", Growing, max_episode_steps=50)
@@ -239,6 +245,7 @@ gym.register("AcmrCountedPendulum-v0", lambda **kwargs: Counted(PendulumEnv(**kw
         ("AcmrTiring-v0", ANYTIME),
         ("AcmrHiding-v0", BETWEEN_EPISODES),
         ("AcmrGrowing-v0", NEVER),
+        ("AcmrCollecting-v0", BETWEEN_EPISODES),
         ("Pendulum-v1", BETWEEN_EPISODES),
         ("AcmrTelling-v0", ANYTIME),
         ("AcmrCounting-v0", NEVER),
@@ -256,7 +263,7 @@ def test_a_check_finds_out_when_an_environment_can_be_stored(name, when):
 def test_a_state_that_does_not_fit_is_refused():
     env = make_env(environment_config("ant"))
     env.reset(seed=1)
-    state = capture(env, in_episode=True)
+    state = capture(env, whole=True)
     robot = state["robot"]
     for wrong in (
         robot | {"data": {name: array for name, array in robot["data"].items() if name != "xipos"}},
@@ -265,26 +272,3 @@ def test_a_state_that_does_not_fit_is_refused():
     ):
         with pytest.raises((KeyError, ValueError, TypeError)):
             restore(make_env(environment_config("ant")), state | {"robot": wrong})
-
-
-def test_warnings_of_the_simulation_are_counted_and_leave_no_file(tmp_path, monkeypatch):
-    from acmr.envs.physics import no_log_file
-
-    monkeypatch.chdir(tmp_path)
-    env = PhysicsWarnings(make_env(environment_config("ant")))
-    bare = env.unwrapped
-    assert isinstance(bare, MujocoEnv)
-    env.reset(seed=1)
-    action = np.zeros(8, np.float32)
-    with no_log_file():
-        env.step(action)
-        assert env.counts == {}
-        for wanted in (1, 2):
-            bare.data.qvel[0] = np.nan
-            env.step(action)
-            assert env.counts["badqvel"] == wanted
-        bare.data.qpos[0] = 1e30
-        env.step(action)
-    assert env.counts["badqpos"] == 1
-    assert list(tmp_path.iterdir()) == []
-    assert mujoco.get_mju_user_warning() is None

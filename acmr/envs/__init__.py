@@ -98,7 +98,7 @@ def describe(config: EnvConfig) -> EnvDescription:
 
 
 def check_resume(config: EnvConfig) -> ResumeCheck:
-    """Checks when an environment's state can be stored (:mod:`acmr.envs.state`), with three instances of it.
+    """Checks when an environment's state can be stored (:mod:`acmr.envs.state`), with two or three instances of it.
 
     One of them is also tried out, so that :func:`describe` and :func:`make_env` need not do that afterwards.
 

@@ -31,49 +31,40 @@ Env = gym.Env[Any, Any]
 
 
 class RestorableEnv(gym.Wrapper[Any, Any, Any, Any]):
-    """An environment with a state: at any step where every layer's is known, otherwise between two episodes.
+    """An environment with a state.
 
     Args:
         env: As :func:`acmr.envs.make_env` makes it.
+        whole: Whether its state is good at any step; otherwise between two episodes only.
     """
 
-    def __init__(self, env: Env) -> None:
+    def __init__(self, env: Env, whole: bool) -> None:
         super().__init__(env)
-        self._in_episode = False
-
-    def reset(self, **kwargs: Any) -> Any:
-        """Resets, and notes that an episode has begun."""
-        self._in_episode = True
-        return self.env.reset(**kwargs)
-
-    def step(self, action: Any) -> Any:
-        """Steps, and notes whether the episode has ended."""
-        result = self.env.step(action)
-        self._in_episode = not (result[2] or result[3])
-        return result
+        self._whole = whole
 
     def state_dict(self) -> State:
-        """Its state; between two episodes only what outlives a reset."""
-        return capture(self.env, self._in_episode)
+        """Its state; if that is not whole, then only what outlives the reset that comes next."""
+        return capture(self.env, self._whole)
 
     def load_state_dict(self, state: State) -> None:
         """Goes on from there; between two episodes it is to be reset next."""
         restore(self.env, state)
-        self._in_episode = state["in_episode"]
 
 
-def capture(env: Env, in_episode: bool) -> State:
+def capture(env: Env, whole: bool) -> State:
     """The state of an environment.
 
     Args:
         env: As :func:`acmr.envs.make_env` makes it.
-        in_episode: Whether an episode is under way; otherwise only what outlives a reset is captured.
+        whole: Whether to capture all of its layers, so that it can go on within an episode; otherwise only what is
+            known to outlive a reset, which has to come next. A whole state serves between two episodes, too: a robot
+            may hold numbers that no reset takes back.
     """
     layers, bare = _layers(env), env.unwrapped
-    state: State = {"in_episode": in_episode, "random": bare.np_random.bit_generator.state}
-    # Between two episodes, too: only the layer itself knows what of it outlives a reset.
+    state: State = {"random": bare.np_random.bit_generator.state}
+    # Either way: only the layer itself knows what of it outlives a reset.
     state["layers"] = {name: layer.state_dict() for name, layer in layers.items() if isinstance(layer, Stateful)}
-    if in_episode:
+    if whole:
         state["elapsed_steps"] = {name: limit._elapsed_steps for name, limit in _time_limits(layers)}
         if isinstance(bare, MujocoEnv):
             state["robot"] = _capture_robot(bare)
@@ -81,21 +72,21 @@ def capture(env: Env, in_episode: bool) -> State:
 
 
 def restore(env: Env, state: State) -> None:
-    """Puts a fresh environment into a captured state. One captured between two episodes is to be reset next.
+    """Puts a fresh environment into a captured state.
 
     Raises:
         KeyError: If a part is missing.
         ValueError: If a part does not fit.
     """
-    layers, bare, in_episode = _layers(env), env.unwrapped, state["in_episode"]
-    if in_episode:
+    layers, bare, whole = _layers(env), env.unwrapped, "elapsed_steps" in state
+    if whole:
         # Layers make some of their variables in their first reset; what it sets is overwritten below.
         env.reset()
     bare.np_random.bit_generator.state = state["random"]
     for name, layer in layers.items():
         if isinstance(layer, Stateful):
             layer.load_state_dict(state["layers"][name])
-    if in_episode:
+    if whole:
         for name, limit in _time_limits(layers):
             limit._elapsed_steps = state["elapsed_steps"][name]
         if isinstance(bare, MujocoEnv):
@@ -187,15 +178,19 @@ def try_resume(make: Callable[[], Env], first: Env | None = None) -> ResumeCheck
     actions = rng.uniform(space.low, space.high, (_BEFORE + 2 * _AFTER, *space.low.shape)).astype(np.float32)
     try:
         opening = _play(first, actions[:_BEFORE], reset={"seed": 7})
-        within = _goes_on(first, make, actions[_BEFORE:-_AFTER], None) if knows_all_layers(first) else (False, b"")
         # What does not draw with NumPy has no state of its random numbers that could be stored.
-        is_numpy = isinstance(first.unwrapped.np_random, np.random.Generator)
-        between = _goes_on(first, make, actions[-_AFTER:], {}) if is_numpy else (False, b"")
+        if not isinstance(first.unwrapped.np_random, np.random.Generator):
+            return ResumeCheck(NEVER, opening)
+        rest = actions[_BEFORE:]
+        if knows_all_layers(first):
+            # The next episode belongs to it: a state within this one is of use only where that follows exactly as well.
+            same, trace = _goes_on(first, make, rest, whole=True)
+            if same:
+                return ResumeCheck(ANYTIME, opening + trace)
+        same, trace = _goes_on(first, make, rest, whole=False)
+        return ResumeCheck(BETWEEN_EPISODES if same else NEVER, opening + trace)
     finally:
         first.close()
-    # The state within an episode is of use only where the next episode follows exactly as well.
-    when = NEVER if not between[0] else ANYTIME if within[0] else BETWEEN_EPISODES
-    return ResumeCheck(when, opening + within[1] + between[1])
 
 
 def knows_all_layers(env: Env) -> bool:
@@ -205,19 +200,28 @@ def knows_all_layers(env: Env) -> bool:
     return known and isinstance(bare, MujocoEnv | Stateful)
 
 
-def _goes_on(
-    env: Env, make: Callable[[], Env], actions: np.ndarray, reset: Mapping[str, Any] | None
-) -> tuple[bool, bytes]:
-    """Whether a second instance does the same from here on, and what it should do; ``reset`` begins an episode."""
+def _goes_on(env: Env, make: Callable[[], Env], actions: np.ndarray, *, whole: bool) -> tuple[bool, bytes]:
+    """Whether a second instance does the same from here on, and what it should do.
+
+    With its whole state it goes on within the episode and into the next one, otherwise it begins with two new ones.
+    """
     # A copy, as a file would hold it: a state may share memory with the environment that goes on first.
-    state = copy.deepcopy(capture(env, in_episode=reset is None))
-    expected = _play(env, actions, reset)
+    state = copy.deepcopy(capture(env, whole))
+    expected = _play_on(env, actions, whole)
     second = make()
     try:
         restore(second, state)
-        return _play(second, actions, reset) == expected, expected
+        return _play_on(second, actions, whole) == expected, expected
+    except (KeyError, ValueError, TypeError):
+        # What does not fit into a new instance: an array that grows with the steps, a number that was none at first.
+        return False, expected
     finally:
         second.close()
+
+
+def _play_on(env: Env, actions: np.ndarray, in_episode: bool) -> bytes:
+    """What the environment returns to half of the actions in this episode, and to the others in the next one."""
+    return _play(env, actions[:_AFTER], None if in_episode else {}) + _play(env, actions[_AFTER:], {})
 
 
 def _like(array: np.ndarray | np.generic, stored: np.ndarray) -> np.ndarray:

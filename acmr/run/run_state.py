@@ -17,7 +17,7 @@ from acmr.agent.replay_files import ReplayFiles, replay_bytes
 from acmr.config import ConfigError, ExperimentConfig
 from acmr.envs import make_env
 from acmr.envs.physics import PhysicsWarnings
-from acmr.envs.state import RestorableEnv
+from acmr.envs.state import ANYTIME, RestorableEnv
 from acmr.records import DamagedError
 from acmr.run.preparation import Prepared
 from acmr.run.run_logs import RunLogs
@@ -122,7 +122,8 @@ class RunState:
 
 def make_state(prepared: Prepared, run_dir: RunDir) -> RunState:
     """Makes the parts of a run as they are before its first step; touches no disk."""
-    env, logs = RestorableEnv(make_env(prepared.spec.config.env)), RunLogs(run_dir, prepared.about)
+    env = RestorableEnv(make_env(prepared.spec.config.env), whole=prepared.resume_check.when == ANYTIME)
+    logs = RunLogs(run_dir, prepared.about)
     warnings = PhysicsWarnings(env)
     trainer = make_trainer(prepared, warnings, logs)
     return RunState(trainer, env, warnings, ReplayFiles(run_dir.checkpoint_folder, trainer.buffer), logs)
