@@ -95,19 +95,19 @@ class Dense:
             self._weight_gradient, self._bias_gradient = block.weight_gradient, block.bias_gradient
             self._weight_gradients = list(block.weight_gradient)
 
-    def forward(self, place: Activations) -> None:
+    def forward(self, activations: Activations) -> None:
         """Writes the output."""
-        place.fetch()
+        activations.fetch()
         # Both critics in one call: one after the other takes 6% longer (docs/performance.md).
-        torch.bmm(place.inputs, self.weight, out=place.output)
-        self.finish(place.output)
+        torch.bmm(activations.inputs, self.weight, out=activations.output)
+        self.finish(activations.output)
 
-    def forward_shared(self, inputs: Tensor, place: Activations) -> None:
+    def forward_shared(self, inputs: Tensor, activations: Activations) -> None:
         """Writes the output for inputs (batch, in) that all networks read."""
         # A batched product would first copy the inputs, the largest operand there is, since it shares none.
-        for weight, output in zip(self._weights, place.outputs, strict=True):
+        for weight, output in zip(self._weights, activations.outputs, strict=True):
             torch.mm(inputs, weight, out=output)
-        self.finish(place.output)
+        self.finish(activations.output)
 
     def finish(self, output: Tensor) -> None:
         """Turns products with the weights into the output."""
@@ -115,30 +115,30 @@ class Dense:
         if self.relu:
             output.relu_()
 
-    def through_activation(self, place: Activations) -> None:
+    def through_activation(self, activations: Activations) -> None:
         """Takes the gradient of the output to that of the sum before the activation."""
         if self.relu:
             # ReLU passes a gradient on where its output is above 0: the sum before it need not be kept.
-            _relu_backward(place.gradient, place.output, 0.0, grad_input=place.gradient)
+            _relu_backward(activations.gradient, activations.output, 0.0, grad_input=activations.gradient)
 
-    def parameter_gradients(self, place: Activations) -> None:
+    def parameter_gradients(self, activations: Activations) -> None:
         """Writes the gradients of weight and bias."""
         # With y = x W + b: dW = x^T dy and db = the sum of dy over the batch.
-        torch.bmm(place.inputs_transposed, place.gradient, out=self._weight_gradient)
-        torch.sum(place.gradient, dim=1, keepdim=True, out=self._bias_gradient)
+        torch.bmm(activations.inputs_transposed, activations.gradient, out=self._weight_gradient)
+        torch.sum(activations.gradient, dim=1, keepdim=True, out=self._bias_gradient)
 
-    def parameter_gradients_shared(self, inputs: Tensor, place: Activations) -> None:
+    def parameter_gradients_shared(self, inputs: Tensor, activations: Activations) -> None:
         """The same where all networks read these inputs, (batch, in)."""
         transposed = inputs.t()
-        for gradient, of_weight in zip(place.gradients, self._weight_gradients, strict=True):
+        for gradient, of_weight in zip(activations.gradients, self._weight_gradients, strict=True):
             torch.mm(transposed, gradient, out=of_weight)
-        torch.sum(place.gradient, dim=1, keepdim=True, out=self._bias_gradient)
+        torch.sum(activations.gradient, dim=1, keepdim=True, out=self._bias_gradient)
 
-    def input_gradient(self, place: Activations) -> None:
+    def input_gradient(self, activations: Activations) -> None:
         """Writes the gradient of the inputs."""
         # dx = dy W^T, with the transposed view of the weights, which a product takes without a copy.
-        torch.bmm(place.gradient, self._transposed, out=place.input_gradient)
-        place.hand_down()
+        torch.bmm(activations.gradient, self._transposed, out=activations.input_gradient)
+        activations.hand_down()
 
 
 class Scalar(Dense):
@@ -152,24 +152,24 @@ class Scalar(Dense):
         if self.learns:
             self._vector_gradients = [array_of(gradient[:, 0]) for gradient in self._weight_gradient]
 
-    def forward(self, place: Activations) -> None:
+    def forward(self, activations: Activations) -> None:
         """Writes the output."""
-        place.fetch()
-        for vector, (inputs, output, _) in zip(self._vectors, place.vectors, strict=True):
+        activations.fetch()
+        for vector, (inputs, output, _) in zip(self._vectors, activations.vectors, strict=True):
             self._math.matmul(inputs, vector, out=output)
-        self.finish(place.output)
+        self.finish(activations.output)
 
-    def parameter_gradients(self, place: Activations) -> None:
+    def parameter_gradients(self, activations: Activations) -> None:
         """Writes the gradients of weight and bias."""
-        for of_vector, (inputs, _, gradient) in zip(self._vector_gradients, place.vectors, strict=True):
+        for of_vector, (inputs, _, gradient) in zip(self._vector_gradients, activations.vectors, strict=True):
             self._math.matmul(inputs.T, gradient, out=of_vector)
-        torch.sum(place.gradient, dim=1, keepdim=True, out=self._bias_gradient)
+        torch.sum(activations.gradient, dim=1, keepdim=True, out=self._bias_gradient)
 
-    def input_gradient(self, place: Activations) -> None:
+    def input_gradient(self, activations: Activations) -> None:
         """Writes the gradient of the inputs."""
         # (batch, 1) times (1, in) is an outer product: no sums, so a plain multiplication with broadcasting.
-        torch.mul(place.gradient, self._transposed, out=place.input_gradient)
-        place.hand_down()
+        torch.mul(activations.gradient, self._transposed, out=activations.input_gradient)
+        activations.hand_down()
 
 
 class Stack:
@@ -181,7 +181,7 @@ class Stack:
     """
 
     def __init__(self, blocks: Sequence[LayerParameters], relus: Sequence[bool]) -> None:
-        # The first layer reads what no place holds, so it is never the special case of one output.
+        # The first layer reads what no activations hold, so it is never the special case of one output.
         kinds = [Dense, *(Scalar if block.weight.shape[2] == 1 else Dense for block in blocks[1:])]
         self.layers = [kind(block, relu) for kind, block, relu in zip(kinds, blocks, relus, strict=True)]
         learning = [index for index, layer in enumerate(self.layers) if layer.learns]
@@ -190,44 +190,44 @@ class Stack:
 
     def allocate(self, batch_size: int) -> list[Activations]:
         """Memory for passes of batches of one size, by layer."""
-        places: list[Activations] = []
+        activations: list[Activations] = []
         for layer in self.layers:
-            places.append(Activations(layer, batch_size, places[-1] if places else None))
-        return places
+            activations.append(Activations(layer, batch_size, activations[-1] if activations else None))
+        return activations
 
-    def forward(self, inputs: Tensor, places: Sequence[Activations]) -> Tensor:
+    def forward(self, inputs: Tensor, activations: Sequence[Activations]) -> Tensor:
         """Output of the last layer for inputs (batch, in) that all networks read."""
-        self.layers[0].forward_shared(inputs, places[0])
-        return self.upper_layers(places)
+        self.layers[0].forward_shared(inputs, activations[0])
+        return self.upper_layers(activations)
 
-    def upper_layers(self, places: Sequence[Activations]) -> Tensor:
+    def upper_layers(self, activations: Sequence[Activations]) -> Tensor:
         """Output of the last layer, given that of the first."""
-        for layer, place in zip(self.layers[1:], places[1:], strict=True):
-            layer.forward(place)
-        return places[-1].output
+        for layer, own in zip(self.layers[1:], activations[1:], strict=True):
+            layer.forward(own)
+        return activations[-1].output
 
-    def backward(self, inputs: Tensor, places: Sequence[Activations]) -> None:
-        """Writes the gradients of all parameters that learn, given that of the output in the last place."""
+    def backward(self, inputs: Tensor, activations: Sequence[Activations]) -> None:
+        """Writes the gradients of all parameters that learn, given that of the output in the last activations."""
         for index in range(len(self.layers) - 1, self._lowest_learning - 1, -1):
-            layer, place = self.layers[index], places[index]
-            layer.through_activation(place)
+            layer, own = self.layers[index], activations[index]
+            layer.through_activation(own)
             # A frozen layer hands the gradient down to those below it and computes none of its own.
             if layer.learns and index:
-                layer.parameter_gradients(place)
+                layer.parameter_gradients(own)
             elif layer.learns:
-                layer.parameter_gradients_shared(inputs, place)
+                layer.parameter_gradients_shared(inputs, own)
             if index > self._lowest_learning:
-                layer.input_gradient(place)
+                layer.input_gradient(own)
 
-    def backward_to_first(self, places: Sequence[Activations]) -> None:
-        """Leaves the gradient of the first layer's sums in its place; the parameters' gradients stay as they are."""
+    def backward_to_first(self, activations: Sequence[Activations]) -> None:
+        """Leaves the gradient of the first layer's sums in its activations, and those of the parameters as they are."""
         for index in range(len(self.layers) - 1, -1, -1):
             # The actor's update asks how values change with actions and changes no critic: without the gradients of
             # their weights an update takes 1 / 1.15 of the time.
-            layer, place = self.layers[index], places[index]
-            layer.through_activation(place)
+            layer, own = self.layers[index], activations[index]
+            layer.through_activation(own)
             if index:
-                layer.input_gradient(place)
+                layer.input_gradient(own)
 
 
 class CriticStack(Stack):
@@ -259,22 +259,22 @@ class CriticStack(Stack):
         for weight, bias, sums in zip(self._of_observations, self.layers[0].bias, self._shared, strict=True):
             torch.addmm(bias, observations, weight, out=sums)
 
-    def forward_actions(self, actions: Tensor, places: Sequence[Activations]) -> Tensor:
+    def forward_actions(self, actions: Tensor, activations: Sequence[Activations]) -> Tensor:
         """Values, (networks, batch, 1), of actions (batch, action) at the observations that were shared."""
         # The sums for the observations are kept: addmm writes shared + a W_a elsewhere.
         actions = actions.to(self.layers[0].weight.dtype)
-        for shared, weight, sums in zip(self._shared, self._of_actions, places[0].outputs, strict=True):
+        for shared, weight, sums in zip(self._shared, self._of_actions, activations[0].outputs, strict=True):
             torch.addmm(shared, actions, weight, out=sums)
         if self.layers[0].relu:
-            places[0].output.relu_()
-        return self.upper_layers(places)
+            activations[0].output.relu_()
+        return self.upper_layers(activations)
 
-    def action_gradient(self, places: Sequence[Activations]) -> Tensor:
-        """Gradient of the actions, (batch, action), given that of the values in the last place."""
-        self.backward_to_first(places)
+    def action_gradient(self, activations: Sequence[Activations]) -> Tensor:
+        """Gradient of the actions, (batch, action), given that of the values in the last activations."""
+        self.backward_to_first(activations)
         # Both critics read the same actions, so their gradients add up (one of them is zero in each row).
-        (first, *others), (weight, *weights) = places[0].gradients, self._of_actions_transposed
+        (first, *others), (weight, *weights) = activations[0].gradients, self._of_actions_transposed
         gradient = torch.mm(first, weight)
         for of_network, weight in zip(others, weights, strict=True):
             torch.addmm(gradient, of_network, weight, out=gradient)
-        return gradient.to(places[-1].gradient.dtype)
+        return gradient.to(activations[-1].gradient.dtype)
