@@ -22,8 +22,10 @@ def linear(in_features: int, out_features: int, generator: torch.Generator) -> n
 
     Weights and biases are uniform in +-1/sqrt(in_features), as ``torch.nn.Linear.reset_parameters`` has them.
     """
-    # Without its own initialization, which draws from torch's global generator.
-    layer: nn.Linear = nn.utils.skip_init(nn.Linear, in_features, out_features)
+    # Its own initialization draws from torch's global generator, which is put back. (torch.nn.utils.skip_init would
+    # not draw at all, but loads sympy: a quarter of a second for each process.)
+    with torch.random.fork_rng(devices=[]):
+        layer = nn.Linear(in_features, out_features)
     bound = 1.0 / math.sqrt(in_features)
     with torch.no_grad():
         layer.weight.uniform_(-bound, bound, generator=generator)
