@@ -69,6 +69,24 @@ class EpisodeRecord:
     mean_forward_velocity: float | None = None
     reward_terms: dict[str, float] = field(default_factory=dict)
 
+    @classmethod
+    def from_row(cls, global_step: int, row: Mapping[str, float]) -> EpisodeRecord:
+        """The episode of a row of ``episodes.csv``.
+
+        Raises:
+            KeyError: If one of ``EPISODE_COLUMNS`` is missing.
+        """
+        terms = dict(row)
+        total, length = (terms.pop(name) for name in EPISODE_COLUMNS[1:])
+        velocity = terms.pop(VELOCITY_COLUMN, None)
+        return cls(global_step, total, int(length), velocity, terms)
+
+    def row(self) -> dict[str, float]:
+        """The episode as a row of ``episodes.csv``: its columns, in their order, after ``global_step``."""
+        own = dict(zip(EPISODE_COLUMNS[1:], (self.episodic_return, self.episode_length), strict=True))
+        velocity = {} if self.mean_forward_velocity is None else {VELOCITY_COLUMN: self.mean_forward_velocity}
+        return {**own, **velocity, **self.reward_terms}
+
 
 @dataclass
 class EpisodeInProgress:

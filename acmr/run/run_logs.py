@@ -38,7 +38,7 @@ class RunLogs(Observer):
     """
 
     def __init__(self, run_dir: RunDir, about: EnvDescription) -> None:
-        self._run_dir, self._about = run_dir, about
+        self._run_dir = run_dir
         velocity = [VELOCITY_COLUMN] if about.has_forward_velocity else []
         self._columns = [*EPISODE_COLUMNS, *velocity, *about.reward_terms]
         self._logs: dict[str, CsvLog] = {}
@@ -68,10 +68,8 @@ class RunLogs(Observer):
     def on_episode(self, record: EpisodeRecord) -> None:
         """Appends a row to ``episodes.csv``."""
         self.history.append(record)
-        velocity = [record.mean_forward_velocity] if self._about.has_forward_velocity else []
-        terms = [record.reward_terms[name] for name in self._about.reward_terms]
-        row = [record.global_step, record.episodic_return, record.episode_length, *velocity, *terms]
-        self._logs["episodes"].row(row)
+        row = record.row()
+        self._logs["episodes"].row([record.global_step, *(row[name] for name in self._columns[1:])])
 
     def on_metrics(self, step: int, values: Mapping[str, float]) -> None:
         """Appends a row to ``metrics.csv``."""
@@ -108,13 +106,8 @@ class RunLogs(Observer):
             rows = csv.DictReader(stream)
             if rows.fieldnames != self._columns:
                 raise DamagedError(f"{path}: not the columns of this run")
-            return [self._record(row) for row in rows]
+            return [_record(row) for row in rows]
 
-    def _record(self, row: Mapping[str, str]) -> EpisodeRecord:
-        return EpisodeRecord(
-            int(row["global_step"]),
-            float(row["episodic_return"]),
-            int(row["episode_length"]),
-            float(row[VELOCITY_COLUMN]) if self._about.has_forward_velocity else None,
-            {name: float(row[name]) for name in self._about.reward_terms},
-        )
+
+def _record(row: dict[str, str]) -> EpisodeRecord:
+    return EpisodeRecord.from_row(int(row.pop("global_step")), {name: float(text) for name, text in row.items()})

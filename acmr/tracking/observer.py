@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from acmr.records import VELOCITY_COLUMN, EpisodeRecord
+from acmr.records import EpisodeRecord
 from acmr.text import one_line
 
 if TYPE_CHECKING:
@@ -130,10 +130,3 @@ def close_all(observers: Iterable[Observer], summary: Mapping[str, Any] | None) 
             errors.append(error)
     if errors:
         raise errors[0]
-
-
-def episode_row(record: EpisodeRecord) -> dict[str, float]:
-    """An episode as trackers show it: the columns of ``episodes.csv`` but ``global_step``."""
-    velocity = {} if record.mean_forward_velocity is None else {VELOCITY_COLUMN: record.mean_forward_velocity}
-    own = {"episodic_return": record.episodic_return, "episode_length": record.episode_length}
-    return {**own, **velocity, **record.reward_terms}

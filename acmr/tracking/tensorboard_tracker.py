@@ -13,7 +13,7 @@ from typing import Any
 
 from acmr.records import EVENTS_FOLDER, EpisodeRecord
 from acmr.settings.run_spec import RunSpec
-from acmr.tracking.observer import Say, Tracker, episode_row
+from acmr.tracking.observer import Say, Tracker
 
 
 class TensorBoardTracker(Tracker):
@@ -51,7 +51,7 @@ class TensorBoardTracker(Tracker):
 
     def on_episode(self, record: EpisodeRecord) -> None:
         """Writes the columns of ``episodes.csv``."""
-        self._scalars(record.global_step, episode_row(record))
+        self._scalars(record.global_step, record.row())
 
     def on_metrics(self, step: int, values: Mapping[str, float]) -> None:
         """Writes the columns of ``metrics.csv``."""

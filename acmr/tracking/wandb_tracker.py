@@ -19,7 +19,7 @@ from acmr.records import EpisodeRecord
 from acmr.settings.run_spec import RunSpec
 from acmr.text import one_line
 from acmr.tracking import wandb_backend
-from acmr.tracking.observer import Say, Tracker, episode_row
+from acmr.tracking.observer import Say, Tracker
 from acmr.tracking.wandb_backend import LONGEST
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class WandbTracker(Tracker):
 
     def on_episode(self, record: EpisodeRecord) -> None:
         """Logs one row on the axis ``global_step``."""
-        self._log(record.global_step, episode_row(record))
+        self._log(record.global_step, record.row())
 
     def on_metrics(self, step: int, values: Mapping[str, float]) -> None:
         """Logs one row on the axis ``global_step``."""

@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 
 from acmr.config import ConfigError, TrackingConfig
-from acmr.records import EPISODES_FILE, METRICS_FILE, VELOCITY_COLUMN, EpisodeRecord
+from acmr.records import EPISODES_FILE, METRICS_FILE, EpisodeRecord
 from acmr.settings.run_spec import RunSpec
 from acmr.text import one_line
 from acmr.tracking.observer import Guarded, Observer, Say, Tracker
@@ -87,7 +87,7 @@ def replay(observer: Observer, run_dir: Path) -> None:
         if is_metrics:
             observer.on_metrics(step, row)
         else:
-            observer.on_episode(_record(step, row))
+            observer.on_episode(EpisodeRecord.from_row(step, row))
 
 
 def _started(title: str, make: Callable[[], Observer], say: Say) -> Observer:
@@ -96,11 +96,6 @@ def _started(title: str, make: Callable[[], Observer], say: Say) -> Observer:
     except Exception as error:
         say(f"{title} not started: {one_line(error)}. The run goes on without it.")
         return Observer()
-
-
-def _record(step: int, row: dict[str, float]) -> EpisodeRecord:
-    total, length, velocity = row.pop("episodic_return"), row.pop("episode_length"), row.pop(VELOCITY_COLUMN, None)
-    return EpisodeRecord(step, total, int(length), velocity, row)
 
 
 def _rows(file: Path) -> Iterator[tuple[int, dict[str, float]]]:
