@@ -6,6 +6,7 @@ so that none of them has to load what the others need.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -45,6 +46,8 @@ VELOCITY_COLUMN = "mean_forward_velocity"
 METRIC_COLUMNS = ("global_step", "steps_per_second")
 #: What an environment's ``info`` calls its forward velocity, in m/s.
 VELOCITY_KEY = "x_velocity"
+#: How the names of the terms of the reward begin in an environment's ``info``.
+REWARD_PREFIX = "reward_"
 
 
 class DamagedError(Exception):
@@ -59,7 +62,8 @@ class EpisodeRecord:
         global_step: Environment steps taken in the run when the episode ended, this one's last step included.
         episodic_return: Sum of the raw rewards.
         episode_length: Steps in the episode.
-        mean_forward_velocity: Mean ``x_velocity`` over the episode in m/s; None where it is not reported.
+        mean_forward_velocity: Mean ``x_velocity`` in m/s over the steps that it was reported with, NaN if there were
+            none; None where the environment never reports it.
         reward_terms: Sum over the episode of each ``reward_*`` term that the environment reports.
     """
 
@@ -95,6 +99,7 @@ class EpisodeInProgress:
     Attributes:
         terms: Names of the reward's terms that the environment reports with each step.
         velocity: Whether it reports its forward velocity.
+        reports: Steps that it reported its velocity with.
     """
 
     terms: tuple[str, ...]
@@ -102,6 +107,7 @@ class EpisodeInProgress:
     length: int = 0
     total: float = 0.0
     distance: float = 0.0
+    reports: int = 0
     sums: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -109,21 +115,23 @@ class EpisodeInProgress:
 
     def restart(self) -> None:
         """Begins the next episode."""
-        self.length, self.total, self.distance = 0, 0.0, 0.0
+        self.length, self.total, self.distance, self.reports = 0, 0.0, 0.0, 0
         self.sums = dict.fromkeys(self.terms, 0.0)
 
     def step(self, reward: float, info: Mapping[str, Any]) -> None:
-        """Adds one environment step."""
+        """Adds one environment step; a term that ``info`` does not hold at this step adds nothing."""
         self.length += 1
         self.total += reward
-        if self.velocity:
+        if self.velocity and VELOCITY_KEY in info:
             self.distance += float(info[VELOCITY_KEY])
+            self.reports += 1
         for name in self.terms:
-            self.sums[name] += float(info[name])
+            self.sums[name] += float(info.get(name, 0.0))
 
     def state_dict(self) -> dict[str, Any]:
         """The sums so far."""
-        return {"length": self.length, "total": self.total, "distance": self.distance, "sums": dict(self.sums)}
+        sums = {"total": self.total, "distance": self.distance, "sums": dict(self.sums)}
+        return {"length": self.length, "reports": self.reports, **sums}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on with these sums.
@@ -134,11 +142,11 @@ class EpisodeInProgress:
         if state["sums"].keys() != set(self.terms):
             raise ValueError("an episode with other terms of the reward")
         self.length, self.total, self.distance = state["length"], state["total"], state["distance"]
-        self.sums = dict(state["sums"])
+        self.reports, self.sums = state["reports"], dict(state["sums"])
 
     def record(self, global_step: int) -> EpisodeRecord:
         """The episode, ended at ``global_step``."""
-        velocity = self.distance / self.length if self.velocity else None
+        velocity = (self.distance / self.reports if self.reports else math.nan) if self.velocity else None
         return EpisodeRecord(global_step, self.total, self.length, velocity, dict(self.sums))
 
 

@@ -16,12 +16,13 @@ import mujoco
 import numpy as np
 from gymnasium.spaces import Box
 
-from acmr.config import EnvConfig
+from acmr.config import ConfigError, EnvConfig
 from acmr.envs.construct import cannot_run, construct
+from acmr.envs.conversion import ConvertedEnv, FaultyEnvironmentError
 from acmr.envs.naming import part_names, probe
 from acmr.envs.state import ResumeCheck, try_resume
 from acmr.envs.wrappers import PartialEnv, kept_rows
-from acmr.records import VELOCITY_KEY
+from acmr.records import REWARD_PREFIX, VELOCITY_KEY
 
 __all__ = ["EnvDescription", "check_resume", "describe", "make_env"]
 
@@ -60,7 +61,8 @@ _tried_out: dict[str, EnvDescription] = {}
 def make_env(config: EnvConfig, render_mode: str | None = None) -> gym.Env[np.ndarray, np.ndarray]:
     """Makes an environment with one-dimensional Box spaces and its time limit.
 
-    Observations or actions of several dimensions are flattened. No wrapper checks what is passed to it.
+    Observations or actions of several dimensions, and observations that are made of parts, are flattened. What it takes
+    and gives is copied, converted and checked (:mod:`acmr.envs.conversion`).
 
     Args:
         config: The environment's settings.
@@ -106,7 +108,13 @@ def check_resume(config: EnvConfig) -> ResumeCheck:
         ConfigError: As :func:`make_env`.
     """
     whole, env = _tried(config)
-    return try_resume(lambda: make_env(config), _with_kept(config, whole, env))
+    try:
+        return try_resume(lambda: make_env(config), _with_kept(config, whole, env))
+    except Exception as error:
+        # What was refused says itself what is wrong; anything else is what code of the environment raised.
+        if isinstance(error, ConfigError) and not isinstance(error, FaultyEnvironmentError):
+            raise
+        raise cannot_run(config, error) from error
 
 
 def _try_out(config: EnvConfig) -> EnvDescription:
@@ -117,7 +125,7 @@ def _try_out(config: EnvConfig) -> EnvDescription:
     return _tried_out[key]
 
 
-def _tried(config: EnvConfig) -> tuple[EnvDescription, gym.Env[Any, Any]]:
+def _tried(config: EnvConfig) -> tuple[EnvDescription, ConvertedEnv]:
     """An instance that has been tried out, and what was seen of it."""
     env = construct(config)
     try:
@@ -134,7 +142,7 @@ def _key(config: EnvConfig) -> str:
     return json.dumps(made_from, sort_keys=True, default=repr)
 
 
-def _look_at(env: gym.Env[Any, Any]) -> EnvDescription:
+def _look_at(env: ConvertedEnv) -> EnvDescription:
     seen, actions, model = probe(env), env.action_space, getattr(env.unwrapped, "model", None)
     assert isinstance(actions, Box)
     assert env.spec is not None
@@ -145,7 +153,7 @@ def _look_at(env: gym.Env[Any, Any]) -> EnvDescription:
         action_high=tuple(actions.high.ravel().tolist()),
         max_episode_steps=env.spec.max_episode_steps,
         bodies=part_names(model).bodies[1:] if isinstance(model, mujoco.MjModel) else (),
-        reward_terms=tuple(key for key in seen.info_keys if key.startswith("reward_")),
+        reward_terms=tuple(key for key in seen.info_keys if key.startswith(REWARD_PREFIX)),
         has_forward_velocity=VELOCITY_KEY in seen.info_keys,
         model_hash=_hash(env),
     )

@@ -20,6 +20,8 @@ from gymnasium.spaces import Box
 
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs.bodies import without_bodies
+from acmr.envs.conversion import ConvertedEnv, FaultyEnvironmentError
+from acmr.envs.spaces import is_usable
 from acmr.envs.wrappers import near_matches
 from acmr.text import one_line
 
@@ -55,8 +57,10 @@ def gym_ids() -> list[str]:
     return sorted(ids, key=lambda name: gym.registry[name].version or 0, reverse=True)
 
 
-def construct(config: EnvConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
+def construct(config: EnvConfig, render_mode: str | None = None) -> ConvertedEnv:
     """Builds the environment with its body edited and its time limit, without the checks that slow each step down.
+
+    What it is given and gives back is converted outside of all its wrappers.
 
     Raises:
         ConfigError: If it cannot be built, or if its spaces are not what an agent here can use.
@@ -87,7 +91,7 @@ def construct(config: EnvConfig, render_mode: str | None = None) -> gym.Env[Any,
         except Exception as error:
             raise ConfigError(_reason(config, creator, error)) from error
     _check_spaces(config.id, env)
-    return env
+    return ConvertedEnv(env, config.id)
 
 
 def cannot_run(config: EnvConfig, error: Exception) -> ConfigError:
@@ -98,9 +102,10 @@ def cannot_run(config: EnvConfig, error: Exception) -> ConfigError:
     if config.remove_bodies:
         given.append(f"env.remove_bodies=[{','.join(config.remove_bodies)}]")
     # What a missing body, site or joint looks like in the environment's own code.
-    needed = config.remove_bodies and isinstance(error, LookupError)
+    needed = config.remove_bodies and isinstance(error.__cause__ or error, LookupError)
     why = "its own code needs a part that is gone" if needed else "this environment cannot run"
-    return ConfigError(f"{' '.join(given)}: {why}: {one_line(error)}")
+    reason = error.reason if isinstance(error, FaultyEnvironmentError) else one_line(error)
+    return ConfigError(f"{' '.join(given)}: {why}: {reason}")
 
 
 @contextlib.contextmanager
@@ -148,14 +153,17 @@ def _reason(config: EnvConfig, creator: Any, error: Exception) -> str:
 
 
 def _check_spaces(env_id: str, env: gym.Env[Any, Any]) -> None:
-    for role, space in (("observations", env.observation_space), ("actions", env.action_space)):
-        if not isinstance(space, Box):
-            raise ConfigError(
-                f"env.id={env_id}: its {role} are a {type(space).__name__} space, but only Box spaces "
-                "(arrays of numbers) can be used"
-            )
+    if not is_usable(env.observation_space):
+        raise ConfigError(
+            f"env.id={env_id}: its observations are a {type(env.observation_space).__name__} space that is no fixed "
+            "number of numbers; Box, Discrete, MultiBinary and MultiDiscrete can be used, and Dict and Tuple of these"
+        )
     action = env.action_space
-    assert isinstance(action, Box)
+    if not isinstance(action, Box):
+        raise ConfigError(
+            f"env.id={env_id}: its actions are a {type(action).__name__} space, but only Box spaces "
+            "(arrays of numbers) can be used"
+        )
     if not np.issubdtype(action.dtype, np.floating):
         raise ConfigError(f"env.id={env_id}: its actions are {action.dtype}, but only continuous actions can be used")
     if not (np.isfinite(action.low).all() and np.isfinite(action.high).all() and (action.low < action.high).all()):

@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium.spaces import Box
+
+from acmr.envs.conversion import ConvertedEnv, is_kept
 
 PROBE_STEPS = 10
 
@@ -41,7 +42,7 @@ class Probe:
     Attributes:
         observation_names: One per row of the flattened observation.
         action_names: One per row of the flattened action.
-        info_keys: Names of the numbers that ``info`` holds, in order of appearance.
+        info_keys: Names of what ``info`` holds and a run records, in order of appearance.
     """
 
     observation_names: tuple[str, ...]
@@ -81,11 +82,14 @@ def part_names(model: mujoco.MjModel) -> PartNames:
     )
 
 
-def probe(env: gym.Env[Any, Any]) -> Probe:
+def probe(env: ConvertedEnv) -> Probe:
     """Steps a throwaway environment with random actions and names what it sees.
 
     Args:
-        env: With Box spaces; it is reset and stepped, and not fit for use afterwards.
+        env: It is reset and stepped, and not fit for use afterwards.
+
+    Raises:
+        FaultyEnvironmentError: If it fails, or gives what is not finite.
     """
     action_space = env.action_space
     assert isinstance(action_space, Box)
@@ -98,19 +102,23 @@ def probe(env: gym.Env[Any, Any]) -> Probe:
     obeyed = simulated and action_space.shape == (robot.model.nu,)
     info_keys: dict[str, None] = {}
     rng = np.random.default_rng(0)
-    env.reset(seed=0)
+    first, _ = env.reset(seed=0)
+    if not np.isfinite(first).all():
+        raise env.fault("its first observation is not finite")
     for _ in range(PROBE_STEPS):
         action = rng.uniform(action_space.low, action_space.high).astype(action_space.dtype)
-        observation, _, terminated, truncated, info = env.step(action)
+        observation, reward, terminated, truncated, info = env.step(action)
+        if not (np.isfinite(observation).all() and np.isfinite(reward)):
+            raise env.fault("its observation or its reward is not finite")
         observations.append(np.ravel(observation))
         for layout, values in zip(layouts, readings, strict=True):
             values.append(_read(layout, data))
         obeyed = obeyed and np.array_equal(data.ctrl, action)
-        info_keys.update(dict.fromkeys(key for key, value in info.items() if _is_number(value)))
+        info_keys.update(dict.fromkeys(filter(is_kept, info)))
         if terminated or truncated:
             env.reset()
     seen = np.stack(observations)
-    names = tuple(f"obs/{row}" for row in range(seen.shape[1]))
+    names = env.observation_names or tuple(f"obs/{row}" for row in range(seen.shape[1]))
     for layout, values in zip(layouts, readings, strict=True):
         if _agrees(layout, np.stack(values), seen):
             names = tuple(name for block in layout for name in block.names)
@@ -253,7 +261,3 @@ def _named(names: Iterable[str], kind: str) -> tuple[str, ...]:
             taken.add(name)
         result.append(name)
     return tuple(result)
-
-
-def _is_number(value: Any) -> bool:
-    return np.ndim(value) == 0 and np.issubdtype(np.asarray(value).dtype, np.number)

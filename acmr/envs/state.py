@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.wrappers import TimeLimit
 
+from acmr.envs.conversion import ConvertedEnv, number
 from acmr.envs.wrappers import PartialEnv
 from acmr.stateful import State, Stateful
 
@@ -98,6 +99,8 @@ def _layers(env: Env) -> dict[str, Env]:
     found = [env]
     while isinstance(found[-1], gym.Wrapper):
         found.append(found[-1].env)
+    # The conversion has no state; counting it would rename all that lies within.
+    found = [layer for layer in found if not isinstance(layer, ConvertedEnv)]
     return {f"{depth}_{type(layer).__name__}": layer for depth, layer in enumerate(found)}
 
 
@@ -240,7 +243,7 @@ def _play(env: Env, actions: np.ndarray, reset: Mapping[str, Any] | None = None)
         trace.append(np.asarray(env.reset(**reset)[0]).tobytes())
     for action in actions:
         observation, reward, terminated, truncated, info = env.step(action)
-        told = [float(value) for _, value in sorted(info.items()) if isinstance(value, int | float | np.number)]
+        told = [value for key in sorted(info, key=str) if (value := number(info[key])) is not None]
         numbers = np.array([float(reward), terminated, truncated, *told])
         trace += [np.asarray(observation).tobytes(), numbers.tobytes()]
         if terminated or truncated:

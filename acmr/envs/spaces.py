@@ -1,0 +1,121 @@
+"""Observation spaces that are made of parts: their numbers side by side, each with a name, and values as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sized
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
+from gymnasium.spaces.utils import flatdim, flatten, flatten_space
+
+#: Spaces whose values are a fixed number of numbers; a choice among n is n numbers, one of them 1.
+USABLE = (Box, Dict, Tuple, Discrete, MultiBinary, MultiDiscrete)
+
+
+def is_usable(space: Space[Any]) -> bool:
+    """Whether the values of a space are a fixed number of numbers."""
+    return isinstance(space, USABLE) and all(map(is_usable, _parts(space).values()))
+
+
+def names_of(space: Space[Any]) -> tuple[str, ...]:
+    """A name for each number of a space, in Gymnasium's order (:func:`gymnasium.spaces.utils.flatten`).
+
+    A number is called after the keys that lead to it and its index: ``position_0``, ``arm/angle_2``.
+    """
+    names = list(_names(space, ()))
+    if len(set(names)) == len(names) and all(map(str.isprintable, names)):
+        return tuple(names)
+    # Names that mean two things, or cannot be shown, are none.
+    return tuple(f"obs/{row}" for row in range(len(names)))
+
+
+def flat_space(space: Space[Any]) -> Box:
+    """The Box of all numbers of a space, side by side."""
+    flat = flatten_space(space)
+    assert isinstance(flat, Box)
+    return flat
+
+
+def flattened(given: Any, space: Space[Any], dtype: np.dtype[Any]) -> np.ndarray:
+    """The numbers of an observation that is made of parts, (all of them,).
+
+    Raises:
+        ValueError: If it is not made of the parts that its space declares.
+    """
+    return np.concatenate(list(_values(given, space, "its observation"))).astype(dtype, copy=False)
+
+
+def to_array(given: Any, shape: tuple[int, ...], dtype: np.dtype[Any], title: str) -> np.ndarray:
+    """A new array of a value, which may be a list or have dimensions of length one more or less.
+
+    Args:
+        given: What an environment gave.
+        shape: What the array has to have.
+        dtype: What it has to hold; floats are rounded to it, integers have to fit.
+        title: What messages call the value.
+
+    Raises:
+        ValueError: If that is not possible without a loss.
+    """
+    try:
+        array = np.asarray(given)
+    except Exception as error:
+        raise ValueError(f"{title} is no array of numbers ({' '.join(str(error).split())[:120]})") from error
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{title} is {type(given).__name__} of {array.dtype}, but numbers are needed")
+    if _lengths(array.shape) != _lengths(shape):
+        raise ValueError(f"{title} has the shape {array.shape}, but its space declares {shape}")
+    with np.errstate(invalid="ignore", over="ignore"):
+        converted = array.reshape(shape).astype(dtype)
+    if dtype.kind in "biu" and not np.array_equal(converted, array.reshape(shape)):
+        raise ValueError(f"{title} holds numbers that are no {dtype}, which its space declares")
+    return converted
+
+
+def _parts(space: Space[Any]) -> dict[Any, Space[Any]]:
+    if isinstance(space, Dict):
+        return dict(space.spaces)
+    return dict(enumerate(space.spaces)) if isinstance(space, Tuple) else {}
+
+
+def _names(space: Space[Any], path: tuple[Any, ...]) -> Iterator[str]:
+    if isinstance(space, Dict | Tuple):
+        for key, part in _parts(space).items():
+            yield from _names(part, (*path, key))
+        return
+    called = "/".join(map(str, path))
+    # What begins with a digit YAML would take for a number: 1_0 is ten.
+    start = f"{called}_" if called[:1].isalpha() else f"obs/{called}_" if path else "obs/"
+    yield from (f"{start}{row}" for row in range(flatdim(space)))
+
+
+def _values(given: Any, space: Space[Any], title: str) -> Iterator[np.ndarray]:
+    if not isinstance(space, Dict | Tuple):
+        yield _leaf(given, space, title)
+        return
+    parts = _parts(space)
+    if not isinstance(given, Sized) or isinstance(given, str) or len(given) != len(parts):
+        raise ValueError(f"{title} does not have the {len(parts)} parts that its space declares")
+    for key, part in parts.items():
+        try:
+            value = given[key]  # type: ignore[index]
+        except (LookupError, TypeError) as error:
+            raise ValueError(f"{title}[{key!r}] is missing, which its space declares") from error
+        yield from _values(value, part, f"{title}[{key!r}]")
+
+
+def _leaf(given: Any, space: Space[Any], title: str) -> np.ndarray:
+    assert space.shape is not None
+    assert space.dtype is not None
+    array = to_array(given, space.shape, space.dtype, title)
+    if isinstance(space, Box):
+        return array.ravel()
+    # A choice that does not exist would be another one, or none.
+    if not space.contains(array[()]):
+        raise ValueError(f"{title} is {array.tolist()}, which is not in {space}")
+    return np.asarray(flatten(space, array[()]))
+
+
+def _lengths(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(length for length in shape if length != 1)
