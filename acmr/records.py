@@ -32,8 +32,8 @@ EVENTS_FOLDER = "tensorboard"
 RUN_PATTERN = "*/*/seed_*"
 SEED_FOLDER = re.compile(r"seed_(\d+)")
 
-#: States of a run that is under way or was ended early, as ``status.json`` names them.
-RUNNING, STOPPED = "running", "stopped"
+#: States of a run that is under way, was asked to stop or was ended by an error, as ``status.json`` names them.
+RUNNING, STOPPED, FAILED = "running", "stopped", "failed"
 #: States of a run that came to its end, as ``status.json`` and ``summary.json`` name them.
 COMPLETE, DIVERGED = "complete", "diverged"
 ENDED = (COMPLETE, DIVERGED)

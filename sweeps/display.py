@@ -12,10 +12,10 @@ from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
-from acmr.records import COMPLETE, DIVERGED, ENDED, RUNNING, STOPPED
+from acmr.records import COMPLETE, DIVERGED, ENDED, FAILED, RUNNING, STOPPED
 from acmr.text import duration, size
 from sweeps.estimate import Estimate
-from sweeps.folder import FAILED, FINAL, OUTPUT_FILE, WAITING, SweepFolder, SweepRun
+from sweeps.folder import FINAL, OUTPUT_FILE, WAITING, SweepFolder, SweepRun
 from sweeps.plan import Plan, PlannedRun
 from sweeps.table import counts, make_console, reasons, run_table
 from sweeps.view import BLOCKED, LOST, RunStatus, steps_ahead, view_entries

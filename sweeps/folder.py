@@ -17,14 +17,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.records import ENDED
+from acmr.records import ENDED, FAILED
 from acmr.storage.json_files import replace_json
 
 SWEEPS = ".sweeps"
 #: What a training printed, in its run's directory.
 OUTPUT_FILE = "output.log"
-#: States of a run of a sweep, beside those that it says itself.
-WAITING, FAILED = "waiting", "failed"
+#: State of a run of a sweep, beside those that it says itself.
+WAITING = "waiting"
 #: States that a run does not leave within its sweep.
 FINAL = (*ENDED, FAILED)
 #: Folders of former sweeps that are kept.

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from acmr.command import command
-from acmr.records import CONFIG_FILE, RUN_PATTERN, RUNNING, SEED_FOLDER, STATUS_FILE
+from acmr.records import CONFIG_FILE, FAILED, RUN_PATTERN, RUNNING, SEED_FOLDER, STATUS_FILE
 from acmr.text import duration
-from sweeps.folder import FAILED, WAITING, State, SweepFolder, SweepRun, all_folders
+from sweeps.folder import WAITING, State, SweepFolder, SweepRun, all_folders
 from sweeps.table import counts, make_console, reasons, run_table
 from sweeps.view import BLOCKED, LOST, RunStatus, steps_ahead, view_entries, view_run
 

@@ -17,12 +17,12 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig
 
 from acmr.config import ConfigError
-from acmr.records import COMPLETE, RUNNING, STOPPED
+from acmr.records import COMPLETE, FAILED, RUNNING, STOPPED
 from acmr.settings.compose import CONFIG_FOLDER
 from acmr.text import one_line
 from sweeps.display import Display, print_plan
 from sweeps.estimate import estimate
-from sweeps.folder import FAILED, FINAL, State, SweepFolder, SweepRun, all_folders
+from sweeps.folder import FINAL, State, SweepFolder, SweepRun, all_folders
 from sweeps.job import STOP_SIGNALS, write_job
 from sweeps.launchers.base import LauncherAdapter, make_adapter
 from sweeps.launchers.launch import Launch

@@ -12,9 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from acmr.cells import stops
-from acmr.records import COMPLETE, DIVERGED, RUNNING, STOPPED
+from acmr.records import COMPLETE, DIVERGED, FAILED, RUNNING, STOPPED
 from acmr.text import duration
-from sweeps.folder import FAILED, WAITING
+from sweeps.folder import WAITING
 from sweeps.view import BLOCKED, LOST, RunStatus
 
 _COLORS = {COMPLETE: "green", DIVERGED: "magenta", FAILED: "red", RUNNING: "cyan", LOST: "red", BLOCKED: "red"}

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from acmr.cells import full_name, stops
-from acmr.records import COMPLETE, DIVERGED, ENDED, RUNNING, STOPPED, SUMMARY_FILE
+from acmr.records import COMPLETE, DIVERGED, ENDED, FAILED, RUNNING, STOPPED, SUMMARY_FILE
 from acmr.storage.json_files import read_json
 from acmr.storage.processes import is_alive
 from acmr.tracking.status_file import read_status
-from sweeps.folder import FAILED, FINAL, WAITING, State, SweepRun
+from sweeps.folder import FINAL, WAITING, State, SweepRun
 
 #: A run that says it is running, but whose process is gone or has said nothing for so many seconds.
 LOST, SILENCE = "lost", 600.0
@@ -169,6 +169,9 @@ def _told(status: dict[str, Any], state: State, alive: bool) -> tuple[str, str]:
         return state.state, state.reason
     if alive:
         return RUNNING, ""
+    # Where a sweep has more to do with it, what became of an earlier attempt says nothing of how it stands.
+    if status.get("state") == FAILED and state == State(STOPPED):
+        return FAILED, str(status.get("cause") or "")
     if status.get("state") == RUNNING:
         return LOST, "its process is gone; the command that started it goes on with it"
     return (STOPPED if status else state.state), state.reason

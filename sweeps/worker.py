@@ -19,9 +19,9 @@ from omegaconf import DictConfig
 
 from acmr.command import command
 from acmr.config import ConfigError
-from acmr.records import COMPLETE, ENDED, RUNNING, STOPPED
+from acmr.records import COMPLETE, ENDED, FAILED, RUNNING, STOPPED
 from acmr.storage.run_dir import RunDir
-from sweeps.folder import FAILED, FINAL, OUTPUT_FILE, State, SweepFolder, SweepRun
+from sweeps.folder import FINAL, OUTPUT_FILE, State, SweepFolder, SweepRun
 from sweeps.job import STOP_SIGNALS, TrainingProcess
 
 #: The run that a job takes up where it may choose.

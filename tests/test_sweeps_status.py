@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from acmr.records import RUNNING, STOPPED
-from sweeps.folder import FAILED, State, SweepFolder, SweepRun, all_folders
+from acmr.records import FAILED, RUNNING, STOPPED
+from sweeps.folder import State, SweepFolder, SweepRun, all_folders
 from sweeps.status import main
 from sweeps.table import counts
 from sweeps.view import view_entries, view_run
@@ -66,6 +66,7 @@ def sweep(out: Path, *entries: SweepRun) -> SweepFolder:
         (lambda folder: None, "stopped"),
         (heartbeat, "running"),
         (lambda folder: heartbeat(folder, "stopped"), "stopped"),
+        (lambda folder: heartbeat(folder, "failed", cause="KeyError: 'x'"), "failed"),
         (lambda folder: heartbeat(folder, process=gone()), "lost"),
         (lambda folder: heartbeat(folder, age=3600), "lost"),
         (lambda folder: heartbeat(folder, host="elsewhere", process=1), "running"),

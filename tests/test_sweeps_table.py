@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.text import Text
 from test_sweeps_status import ended, heartbeat
 
-from acmr.records import COMPLETE, RUNNING
-from sweeps.folder import FAILED, WAITING
+from acmr.records import COMPLETE, FAILED, RUNNING
+from sweeps.folder import WAITING
 from sweeps.table import reasons, run_table, shorten
 from sweeps.view import BLOCKED, LOST, RunStatus
 

@@ -16,7 +16,7 @@ from acmr.run.preparation import Prepared, prepare
 from acmr.run.run_state import RunState, check_space, make_state
 from acmr.run.stop_signals import StopSignals
 from acmr.run.summary import describe_teacher, reached, summarize
-from acmr.run.trainer import DivergedError, Trainer
+from acmr.run.trainer import DivergedError, FailedError, Trainer
 from acmr.settings.run_spec import RunSpec
 from acmr.storage.durable import StorageError, WriteError
 from acmr.storage.run_dir import RunDir, RunHeldError, holds_run
@@ -101,6 +101,9 @@ class Session:
             return self._train(checkpoints, state)
         except WriteError as error:
             raise StorageError(self.run_dir.path, error, checkpoints.latest) from error
+        except FailedError as error:
+            then = f"; it resumes at step {checkpoints.latest:,}" if checkpoints.latest else ""
+            raise FailedError(f"{self.run_dir}: {error}; mend that, then run the same command again{then}") from error
         finally:
             self._close(state)
 

@@ -116,6 +116,9 @@ class RunState:
                 raise ValueError(f"other parts: {', '.join(sorted(state.keys() ^ parts.keys()))}")
             for name, part in parts.items():
                 part.load_state_dict(state[name])
+        except ConfigError:
+            # The environment failed at its first reset, and says so itself; the checkpoint is not to blame.
+            raise
         except (KeyError, ValueError, TypeError, IndexError, AttributeError, RuntimeError, OverflowError) as error:
             raise DamagedError(f"not the state of this run ({one_line(error)})") from error
 

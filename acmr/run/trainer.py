@@ -13,7 +13,8 @@ import torch
 
 from acmr.agent.learner import Learner
 from acmr.agent.replay_buffer import ReplayBuffer
-from acmr.config import THRESHOLD
+from acmr.config import THRESHOLD, ConfigError
+from acmr.envs.conversion import FaultyEnvironmentError
 from acmr.records import EpisodeInProgress
 from acmr.run.preparation import Prepared
 from acmr.run.random_streams import RandomStreams
@@ -33,6 +34,13 @@ class DivergedError(Exception):
     def __init__(self, step: int, cause: str) -> None:
         super().__init__(f"diverged at step {step:,}: {cause}")
         self.step, self.cause = step, cause
+
+
+class FailedError(ConfigError):
+    """The environment raised an exception, or gave what cannot be used, in the middle of a run."""
+
+    #: Not that of what is refused: a simulator that could not be reached may be there at the next attempt.
+    exit_code = 1
 
 
 def _never() -> bool:
@@ -95,7 +103,15 @@ class Trainer:
 
         Raises:
             DivergedError: If a number that must be finite is not.
+            FailedError: If the environment fails.
         """
+        try:
+            self._run()
+        except FaultyEnvironmentError as error:
+            raise FailedError(f"failed at step {self.global_step:,}: {error}") from error
+        self._check_learner()
+
+    def _run(self) -> None:
         since = (time.perf_counter(), self.global_step)
         while not self.is_over:
             self._step()
@@ -105,7 +121,6 @@ class Trainer:
                 self._log((self.global_step - first) / (now - before))
             for observer in self.observers:
                 observer.on_step(self.global_step)
-        self._check_learner()
 
     def _step(self) -> None:
         config, observation = self.agent.config, self.observation

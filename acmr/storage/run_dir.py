@@ -24,16 +24,19 @@ from acmr.records import (
     EPISODES_FILE,
     EVALUATION_FILE,
     EVENTS_FOLDER,
+    FAILED,
     LOG_FILE,
     METRICS_FILE,
+    STATUS_FILE,
     SUMMARY_FILE,
     TENSOR_FILE,
     TRANSFER_FILE,
     DamagedError,
 )
 from acmr.storage.durable import read_regular, remove, remove_leftovers, sync_folder, write_bytes
-from acmr.storage.json_files import write_json
+from acmr.storage.json_files import read_json, replace_json, write_json
 from acmr.storage.processes import is_alive
+from acmr.text import message, one_line
 
 #: Files that a run writes anew when it starts from the beginning; what would make it look finished goes first.
 _RESULTS = (
@@ -125,19 +128,29 @@ class RunDir:
     def log(self, say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
         """Says lines to the user, and keeps each in ``run.log`` with its time.
 
-        A disk that does not take it, or a terminal that is gone, ends no run.
+        A disk that does not take it, or a terminal that is gone, ends no run. An error that leaves the block is kept
+        there as well, and in ``status.json`` if this process had begun to train.
         """
 
-        def both(line: str) -> None:
+        def note(line: str) -> None:
             with suppress(OSError):
                 # A path may hold bytes that are no text.
                 os.write(descriptor, f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n".encode(errors="replace"))
+
+        def both(line: str) -> None:
+            note(line)
             with suppress(OSError, ValueError):
                 say(line)
 
         descriptor = self._open(self.log_file, os.O_WRONLY | os.O_APPEND)
         try:
             yield both
+        except Exception as error:
+            # What is not meant for the user has a message that says little without its type.
+            cause = message(error) if isinstance(error, ConfigError) else one_line(error)
+            note(f"error: {cause}")
+            self._note_failure(cause.removeprefix(f"{self.path}: "))
+            raise
         finally:
             os.close(descriptor)
 
@@ -169,6 +182,14 @@ class RunDir:
             yield
         finally:
             os.close(descriptor)
+
+    def _note_failure(self, cause: str) -> None:
+        path = self.path / STATUS_FILE
+        status = read_json(path)
+        # What another process said of the run stays true where this one has refused to go on with it.
+        if status is not None and status.get("process") == os.getpid():
+            with suppress(OSError):
+                replace_json(path, status | {"state": FAILED, "cause": cause})
 
     def _open(self, path: Path, flags: int) -> int:
         try:
