@@ -9,38 +9,66 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from acmr.command import command, end_at_ctrl_c
+
+# All else is loaded within functions: whoever types Ctrl-C while that goes on is to get one line, too.
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from acmr.settings.run_spec import RunSpec
 
 # Hydra would print several lines and exit; with this it hands us the error, and the user gets one line.
 os.environ["HYDRA_FULL_ERROR"] = "1"
 # Training draws nothing, but mujoco cannot even be imported where this names a library that is missing.
 os.environ.pop("MUJOCO_GL", None)
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 
-from acmr.command import command
-from acmr.settings.compose import parse, register_schema
-from acmr.settings.errors import USER_ERRORS, check_booleans, explain, quote_paths
-from acmr.settings.run_spec import RunSpec, specify
-
-#: Words of a sweep, and where Hydra keeps them: they are no settings of a run.
-SWEEP_WORDS = {word: f"hydra.sweeper.{word}" for word in ("plan", "retries", "workers")}
-
-register_schema()
+@command
+def main() -> int:
+    """Runs the command line; returns the exit code."""
+    end_at_ctrl_c()
+    if len(sys.argv) == 2 and sys.argv[1].startswith("@"):
+        return _exit_code(lambda: _train_job(Path(sys.argv[1][1:])))
+    return _exit_code(_train_as_typed)
 
 
-@hydra.main(version_base="1.3", config_path="conf", config_name="config")
-def train(cfg: DictConfig) -> None:
+def _train_as_typed() -> None:
+    import hydra
+
+    from acmr.settings.command_line import hydra_arguments
+    from acmr.settings.compose import CONFIG_FOLDER, register_schema
+
+    sys.argv[1:] = hydra_arguments(sys.argv[1:])
+    register_schema()
+    # The folder's own path: Hydra would look beside this file, which may have been called through a link.
+    hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="config")(_train)()
+
+
+def _train(cfg: DictConfig) -> None:
     """Runs what the command line describes; sweeps.sweeper does so where that is more than one run."""
+    from hydra.core.hydra_config import HydraConfig
+
+    from acmr.settings.compose import CONFIG_FOLDER, look_in, parse
+    from acmr.settings.errors import check_booleans
+    from acmr.settings.run_spec import specify
+    from acmr.settings.sources import sources_of
 
     def start() -> None:
+        look_in(sources_of(HydraConfig.get(), CONFIG_FOLDER))
         check_booleans(HydraConfig.get().overrides.task)
         _run(specify(parse(cfg)))
 
     # An error that left from here would get a line of Hydra's own before it.
     if code := _exit_code(start):
         sys.exit(code)
+
+
+def _train_job(path: Path) -> None:
+    from sweeps.job import adopt
+
+    _run(adopt(path))
 
 
 def _run(spec: RunSpec) -> None:
@@ -51,32 +79,9 @@ def _run(spec: RunSpec) -> None:
         sys.exit(code)
 
 
-def _train_job(path: str) -> None:
-    from sweeps.job import adopt
-
-    _run(adopt(Path(path)))
-
-
-def _arguments(given: list[str]) -> list[str]:
-    """The command line in Hydra's words."""
-    arguments, several = [], False
-    for argument in quote_paths(given):
-        key, equal, value = argument.partition("=")
-        several = several or key in SWEEP_WORDS
-        arguments.append(f"{SWEEP_WORDS[key]}{equal}{value}" if key in SWEEP_WORDS else argument)
-    return ["--multirun", *arguments] if several else arguments
-
-
-@command
-def main() -> int:
-    """Runs the command line; returns the exit code."""
-    if len(sys.argv) == 2 and sys.argv[1].startswith("@"):
-        return _exit_code(lambda: _train_job(sys.argv[1][1:]))
-    sys.argv[1:] = _arguments(sys.argv[1:])
-    return _exit_code(train)
-
-
 def _exit_code(run: Callable[[], None]) -> int:
+    from acmr.settings.errors import USER_ERRORS, explain
+
     try:
         run()
     except USER_ERRORS as error:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import os
 import select
+import signal
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -35,10 +36,27 @@ def command(main: Callable[_Arguments, int]) -> Callable[_Arguments, int]:
         try:
             return main(*arguments, **more)
         except KeyboardInterrupt:
-            print("stopped by Ctrl-C; the same command starts it again", file=sys.stderr)
-            return INTERRUPTED
+            return _interrupted()
 
     return run
+
+
+def end_at_ctrl_c() -> None:
+    """Lets Ctrl-C end this process where it stands, until somebody else takes care of it.
+
+    Libraries that are being loaded may take a KeyboardInterrupt for an error of their own, and go on without a part of
+    themselves. For programs that hold nothing then which would be lost.
+    """
+    # A notebook's kernel is to stay, and who started this in the background may have chosen that Ctrl-C does nothing.
+    if "IPython" not in sys.modules and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, lambda number, frame: os._exit(_interrupted()))
+
+
+def _interrupted() -> int:
+    # Straight to the stream's number: a signal may come while something else is being printed.
+    with suppress(OSError):
+        os.write(2, b"stopped by Ctrl-C; the same command starts it again\n")
+    return INTERRUPTED
 
 
 def open_closed_streams() -> None:

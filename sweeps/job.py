@@ -19,8 +19,9 @@ from omegaconf import OmegaConf
 
 from acmr.config import ExperimentConfig
 from acmr.records import CONFIG_FILE
-from acmr.settings import compose
+from acmr.settings.compose import look_in
 from acmr.settings.run_spec import RunSpec
+from acmr.settings.sources import stored_sources
 from acmr.storage.json_files import replace_json
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -57,9 +58,10 @@ def adopt(path: Path) -> RunSpec:
     _die_with_parent(int(os.environ.pop(PARENT, os.getppid())))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
     # The student's teacher follows from these files, which nobody edits.
-    compose.CONFIG_FOLDER = path.parent.parent / "conf"
+    folder = path.parent.parent
+    look_in(stored_sources(folder, folder / "conf"))
     spec = read_job(path)
-    begun, planned = spec.directory / CONFIG_FILE, path.parent.parent / "plan.json"
+    begun, planned = spec.directory / CONFIG_FILE, folder / "plan.json"
     if begun.exists() and begun.stat().st_mtime_ns > planned.stat().st_mtime_ns:
         # This sweep has begun it anew already; to be asked for once is to be done once.
         spec = replace(spec, config=replace(spec.config, force=False))

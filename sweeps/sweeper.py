@@ -18,7 +18,8 @@ from omegaconf import DictConfig
 
 from acmr.config import ConfigError
 from acmr.records import COMPLETE, FAILED, RUNNING, STOPPED
-from acmr.settings.compose import CONFIG_FOLDER
+from acmr.settings.compose import CONFIG_FOLDER, look_in, sources
+from acmr.settings.sources import sources_of
 from acmr.text import one_line
 from sweeps.display import Display, print_plan
 from sweeps.estimate import estimate
@@ -66,6 +67,7 @@ def run_sweep(jobs: Sequence[Sequence[str]], settings: Settings, config: DictCon
         ConfigError: If the sweep cannot be made; nothing has been started then.
     """
     _check(settings)
+    look_in(sources_of(config.hydra, CONFIG_FOLDER))
     specs = expand(jobs)
     plan, output_dir = make_plan(specs), Path(specs[0].config.output_dir)
     threads = max(run.spec.config.threads for run in plan.runs)
@@ -95,14 +97,15 @@ class Sweep:
     def __init__(self, plan: Plan, output_dir: Path, settings: Settings, adapter: LauncherAdapter) -> None:
         self._plan, self._settings, self._adapter = plan, settings, adapter
         header = {
-            # As it was typed, not as Hydra got it.
-            "command": shlex.join(["python", *sys.orig_argv[sys.orig_argv.index(sys.argv[0]) :]]),
+            "command": shlex.join(["python", *_typed()]),
             "retries": settings.retries,
             "grace": settings.grace,
         }
         self._entries = entries_of(plan, output_dir)
         try:
-            self._folder = SweepFolder.create(output_dir, header, self._entries, plan.order, CONFIG_FOLDER)
+            main = sources().main or CONFIG_FOLDER
+            self._folder = SweepFolder.create(output_dir, header, self._entries, plan.order, main)
+            sources().store(self._folder.path, self._folder.conf)
             for run in plan.missing:
                 write_job(self._folder.job_file(run.index), run.spec)
         except OSError as error:
@@ -234,6 +237,11 @@ def entries_of(plan: Plan, output_dir: Path) -> list[SweepRun]:
         )
         for run in plan.runs
     ]
+
+
+def _typed() -> list[str]:
+    """The command line as it was typed, not as Hydra got it; in a notebook Python's own is that of the kernel."""
+    return ["run.py", *sys.argv[1:]] if "ipykernel" in sys.modules else sys.orig_argv[1:]
 
 
 def _check(settings: Settings) -> None:

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import torch
 
-from acmr.command import command
 from acmr.config import ConfigError
 from acmr.evaluation.camera import without_gl
 from acmr.evaluation.evaluate import evaluate, still
@@ -23,7 +22,6 @@ from acmr.evaluation.video import FILM_SUFFIXES
 from acmr.records import EVALUATION_FILE
 
 
-@command
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit code: 2 for what cannot be done, with one line that says why."""
     given = _parse(list(sys.argv[1:] if arguments is None else arguments))

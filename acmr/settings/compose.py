@@ -5,28 +5,42 @@ The border to Hydra: what leaves here are plain dataclasses.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, fields, is_dataclass
 from difflib import get_close_matches
-from functools import lru_cache
+from functools import lru_cache, reduce
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
 from acmr.config import ConfigError, EnvConfig, ExperimentConfig, flatten, schema_defaults
+from acmr.settings.sources import SWEEPS, Sources
 from acmr.settings.validate import validate
 
 CONFIG_FOLDER = Path(__file__).resolve().parents[2] / "conf"
+#: Settings that are paths.
+PATH_KEYS = ("transfer.teacher", "output_dir", "tracking.dir")
+_given: Sources | None = None
+
+
+def look_in(sources: Sources) -> None:
+    """Composes settings of the files in these places from now on."""
+    global _given
+    _given = sources
+
+
+def sources() -> Sources:
+    """Where settings files are: as the command line says, else in ``conf`` and ``sweeps``."""
+    return _given or Sources((f"file://{CONFIG_FOLDER}", SWEEPS))
 
 
 def register_schema() -> None:
@@ -49,9 +63,28 @@ def parse(cfg: DictConfig) -> ExperimentConfig:
         key = own or str(error).strip().splitlines()[0].rpartition(": ")[2]
         example = " (for example env.id=Hopper-v5)" if key == "env.id" else ""
         raise ConfigError(f"{key} has no value: type {key}=VALUE{example}") from error
-    assert isinstance(config, ExperimentConfig)
+    if not isinstance(config, ExperimentConfig):
+        raise ConfigError(
+            f"{sources().name}.yaml: the first of its defaults must be schema, as in conf/ of the project"
+        )
+    _expand_paths(config)
     validate(config)
     return config
+
+
+def _expand_paths(config: ExperimentConfig) -> None:
+    for key in PATH_KEYS:
+        *groups, leaf = key.split(".")
+        part = reduce(getattr, groups, config)
+        if (value := getattr(part, leaf)) is None:
+            continue
+        if not value.strip():
+            raise ConfigError(f"{key}=: a path is needed, as in {key}={'runs' if key == 'output_dir' else 'FOLDER'}")
+        # A shell does so at the beginning of a word only, not behind an equal sign.
+        path = os.path.expanduser(value)
+        if path.startswith("~"):
+            raise ConfigError(f"{key}={value}: there is no such user; type ./{value} for a folder of that name")
+        setattr(part, leaf, path)
 
 
 def compose_config(overrides: Sequence[str]) -> DictConfig:
@@ -62,7 +95,7 @@ def compose_config(overrides: Sequence[str]) -> DictConfig:
     # Hydra reads and merges all files anew for every composition, 0.1 s of processor time. A sweep composes every run
     # several times (settings, baseline, teacher, command line), and nearly always from the same few choices of groups.
     parsed = OverridesParser.create().parse_overrides(list(overrides))
-    cfg = deepcopy(_composed(tuple(str(entry.input_line) for entry in parsed if _chooses(entry)), CONFIG_FOLDER))
+    cfg = deepcopy(_composed(tuple(str(entry.input_line) for entry in parsed if _chooses(entry)), sources()))
     # Private, read in hydra-core 1.3.8: there is no public way to set values on a config that is composed already.
     # tests/test_hydra.py fails where it is gone, tests/test_settings_files.py where it makes other configs than Hydra.
     ConfigLoaderImpl._apply_overrides_to_config([entry for entry in parsed if not _chooses(entry)], cfg)
@@ -77,14 +110,10 @@ def _chooses(override: Override) -> bool:
 
 
 @lru_cache(maxsize=256)
-def _composed(choices: tuple[str, ...], folder: Path) -> DictConfig:
-    # The folder is part of the key: a training of a sweep reads the copy that the sweep made of it (sweeps/job.py).
-    # Hydra can be initialized once only, so that within run.py its own application does it.
-    if GlobalHydra.instance().is_initialized():
-        return compose("config", overrides=list(choices))
+def _composed(choices: tuple[str, ...], places: Sources) -> DictConfig:
+    # The places are part of the key: a training of a sweep reads the copies that the sweep made (sweeps/job.py).
     register_schema()
-    with initialize_config_dir(str(folder), version_base="1.3"):
-        return compose("config", overrides=list(choices))
+    return places.compose(list(choices))
 
 
 def _refuse_unknown(node: DictConfig, prefix: str = "") -> None:
@@ -145,13 +174,13 @@ def unknown_key(key: str) -> str:
 
 
 def groups() -> list[str]:
-    """The config groups, such as ``env`` and ``transfer``; those of ``matrix`` lie in sweeps."""
-    return sorted({"matrix", *(entry.name for entry in CONFIG_FOLDER.iterdir() if entry.is_dir())} - {"hydra"})
+    """The config groups, such as ``env`` and ``transfer``."""
+    return sources().groups()
 
 
 def options(group: str) -> list[str]:
     """What may be chosen of a config group: the names of its files."""
-    return sorted(path.stem for path in (CONFIG_FOLDER / group).glob("*.yaml"))
+    return sources().options(group)
 
 
 def launchers() -> list[str]:
@@ -159,19 +188,23 @@ def launchers() -> list[str]:
     return options("hydra/launcher")
 
 
-@lru_cache(maxsize=256)
 def baseline(profile: str, env: str, env_id: str, agent: str, transfer: str) -> dict[str, Any]:
     """The settings, flat, that a profile has for these choices where nothing else is said.
 
     With the rules of the method.
     """
+    return _baseline(profile, env, env_id, agent, transfer, sources())
+
+
+@lru_cache(maxsize=256)
+def _baseline(profile: str, env: str, env_id: str, agent: str, transfer: str, places: Sources) -> dict[str, Any]:
     overrides = [f"profile={profile}", f"agent={agent}", f"transfer={transfer}", *env_overrides(env, env_id)]
     return flatten(asdict(parse(compose_config(overrides))))
 
 
 def env_overrides(name: str, env_id: str | None = None) -> list[str]:
-    """What to type for an environment: its name in ``conf/env``, or a Gymnasium id."""
-    if (CONFIG_FOLDER / "env" / f"{name}.yaml").is_file() and name != "gym":
+    """What to type for an environment: its name in the group ``env``, or a Gymnasium id."""
+    if name in options("env") and name != "gym":
         return [f"env={name}"]
     return ["env=gym", f"env.id={as_override(env_id or name)}"]
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from difflib import get_close_matches
+from shlex import quote
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
@@ -15,13 +16,11 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from acmr.config import ConfigError, ExperimentConfig, flatten
-from acmr.settings.compose import as_override, groups, launchers, options, setting_keys, unknown_key
+from acmr.settings.compose import groups, launchers, options, setting_keys, unknown_key
 from acmr.text import message
 
 #: Settings whose entries are free; Hydra adds to them with a plus sign only.
 FREE_KEYS = ("env.kwargs", "agent.options", "transfer.options", "tracking.options")
-#: Settings that are paths. Names of runs hold equal signs, which Hydra's grammar wants quoted.
-PATH_KEYS = ("transfer.teacher", "output_dir", "tracking.dir")
 #: What a wrong command line or a wrong file of ``conf/`` raises.
 USER_ERRORS = (ConfigError, HydraException, OmegaConfBaseException, YAMLError)
 
@@ -42,6 +41,8 @@ def explain(error: BaseException) -> str:
     if isinstance(error, ConfigCompositionException):
         if match := re.match(r"In '([^']+)': \w+ raised while composing config:\n(.*)\n *full_key: (.*)", text):
             return _wrong_file(*match.groups())
+        if match := re.match(r"(?:Ambiguous value for argument|Sweep parameters) '([^']+)'", text):
+            return f"{match[1]}: several values are several runs; add -m, as in python run.py -m {quote(match[1])}"
         if match := re.match(r"(?:Could not override|Key) '([^']+)'", text):
             key = match[1].split("@")[0]
             if key in FREE_KEYS:
@@ -54,23 +55,6 @@ def explain(error: BaseException) -> str:
         if match := re.match(r"Error merging override (.*)", text):
             return _wrong_type(match[1], error)
     return text.strip().splitlines()[0] if text.strip() else type(error).__name__
-
-
-def quote_paths(arguments: Sequence[str]) -> list[str]:
-    """The command line with every path quoted as Hydra's grammar needs it."""
-    return [_quoted(each) if each.partition("=")[0].lstrip("+") in PATH_KEYS else each for each in arguments]
-
-
-def _quoted(argument: str) -> str:
-    key, _, value = argument.partition("=")
-    if value.startswith(("'", '"')):
-        return argument
-    try:
-        OverridesParser.create().parse_overrides([argument])
-    except OverrideParseException:
-        # An equal sign, as in names of runs, or a letter that is not English.
-        return f"{key}={as_override(value)}"
-    return argument
 
 
 def check_booleans(overrides: Sequence[str]) -> None:

@@ -19,7 +19,7 @@ from acmr.config import (
     plain_settings,
 )
 from acmr.records import DESCRIPTION_FILE
-from acmr.settings.compose import as_override, baseline, compose_config, env_overrides, parse
+from acmr.settings.compose import as_override, baseline, compose_config, env_overrides, parse, sources
 
 #: Settings that a run's name spells out in its own way.
 _NAMED_KEYS = ("seed", "freeze", "agent.name", "transfer.name", "transfer.teacher", "env.name")
@@ -56,7 +56,7 @@ class RunSpec:
     @property
     def command(self) -> str:
         """The shortest command line that makes this run."""
-        return " ".join(["python run.py", *_short_overrides(self)])
+        return " ".join(["python run.py", *sources().words, *_short_overrides(self)])
 
 
 def specify(config: ExperimentConfig) -> RunSpec:

@@ -1,0 +1,101 @@
+"""The command line of ``run.py`` in Hydra's words."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import OverrideParseException
+
+from acmr.config import ConfigError
+from acmr.settings.compose import PATH_KEYS, as_override
+from acmr.settings.sources import SWEEPS
+
+#: Words of a sweep, and where Hydra keeps them: they are no settings of a run.
+SWEEP_WORDS = {word: f"hydra.sweeper.{word}" for word in ("plan", "retries", "workers")}
+#: Further folders of settings files.
+SEARCH_PATH = "hydra.searchpath"
+
+
+def hydra_arguments(given: Sequence[str]) -> list[str]:
+    """The command line as Hydra is to read it.
+
+    Raises:
+        ConfigError: If there are options that Hydra does not have, or a folder is not there.
+    """
+    _check_options(given)
+    arguments = [_in_hydras_words(argument) for argument in given]
+    several = any(argument.partition("=")[0] in SWEEP_WORDS for argument in given)
+    return ["--multirun", *arguments] if several else arguments
+
+
+def _in_hydras_words(argument: str) -> str:
+    key, equal, value = argument.partition("=")
+    if key in SWEEP_WORDS:
+        return f"{SWEEP_WORDS[key]}{equal}{value}"
+    if key.lstrip("+") in PATH_KEYS:
+        return _quoted(key, value)
+    if key.lstrip("+") == SEARCH_PATH:
+        return _search_path(argument)
+    return argument
+
+
+def _quoted(key: str, value: str) -> str:
+    argument = f"{key}={value}"
+    if value.startswith(("'", '"')):
+        return argument
+    try:
+        OverridesParser.create().parse_overrides([argument])
+    except OverrideParseException:
+        # An equal sign, as in names of runs, or a letter that is not English.
+        return f"{key}={as_override(value)}"
+    return argument
+
+
+def _search_path(argument: str) -> str:
+    """Adds to the places that the project needs, where Hydra would put others in their place."""
+    value = OverridesParser.create().parse_overrides([argument])[0].value()
+    places = [_place(str(place)) for place in (value if isinstance(value, list) else [value])]
+    return f"{SEARCH_PATH}={as_override([*dict.fromkeys([*places, SWEEPS])])}"
+
+
+def _place(place: str) -> str:
+    scheme, separator, path = place.rpartition("://")
+    if scheme == "pkg" and find_spec(path.replace("/", ".").partition(".")[0]) is None:
+        raise ConfigError(f"{SEARCH_PATH}: {place}: there is no such package")
+    if separator and scheme != "file":
+        return place
+    folder = Path(path).expanduser()
+    if not folder.is_dir():
+        raise ConfigError(f"{SEARCH_PATH}: {path}: there is no such folder")
+    # Jobs of a sweep may begin elsewhere.
+    return f"file://{folder.absolute()}"
+
+
+def _check_options(given: Sequence[str]) -> None:
+    options = [argument for argument in given if argument.startswith("-")]
+    if not options:
+        return
+    if any(option == "-f" or option.startswith("--f=") for option in options):
+        # What Jupyter tells its kernel; a cell that calls run.main() finds it in sys.argv.
+        raise ConfigError(
+            f"{' '.join(given)}: these are the words of a notebook's kernel; type %run run.py seed=1 in a cell, "
+            "or !python run.py seed=1"
+        )
+    parser = get_args_parser()
+    # Else it would print its usage.
+    parser.exit_on_error = False
+    try:
+        known, unknown = parser.parse_known_args(list(given))
+    except argparse.ArgumentError as error:
+        raise ConfigError(f"{error}; python run.py --hydra-help lists the options") from error
+    if known.config_dir is not None and not Path(known.config_dir).is_dir():
+        raise ConfigError(f"--config-dir {known.config_dir}: there is no such folder")
+    if unknown and not unknown[0].startswith("-"):
+        raise ConfigError(f"{unknown[0]}: stands behind an option; options such as -m go before all settings")
+    if unknown:
+        raise ConfigError(f"{unknown[0]}: no such option; python run.py --hydra-help lists them")
