@@ -16,6 +16,8 @@ from typing import Any
 CONFIG_FILE = "config.yaml"
 #: One row an episode, one row ``log_every`` steps.
 EPISODES_FILE, METRICS_FILE = "episodes.csv", "metrics.csv"
+#: What a run's episodes may lie in; the first that is there is read.
+EPISODE_FILES = (EPISODES_FILE, f"{EPISODES_FILE}.gz")
 #: What was copied, fresh and frozen.
 TRANSFER_FILE = "transfer.json"
 #: Written last: a run that has it came to its end.
@@ -28,8 +30,7 @@ TENSOR_FILE, DESCRIPTION_FILE = "teacher.safetensors", "teacher.json"
 EVALUATION_FILE = "evaluation.json"
 #: Folder of TensorBoard's event files: they show a run, and are no result.
 EVENTS_FOLDER = "tensorboard"
-#: A run's place below the folder of all runs, as a pattern: ``<profile>/<name>/seed_<n>``.
-RUN_PATTERN = "*/*/seed_*"
+#: A run's place below the folder of all runs is ``<profile>/<name>/seed_<n>``.
 SEED_FOLDER = re.compile(r"seed_(\d+)")
 
 #: States of a run that is under way, was asked to stop or was ended by an error, as ``status.json`` names them.
@@ -37,6 +38,8 @@ RUNNING, STOPPED, FAILED = "running", "stopped", "failed"
 #: States of a run that came to its end, as ``status.json`` and ``summary.json`` name them.
 COMPLETE, DIVERGED = "complete", "diverged"
 ENDED = (COMPLETE, DIVERGED)
+#: What other programs call a run that came to its end.
+_FINISHED = ("completed", "finished", "done", "success", "successful", "succeeded", "ended", "ok")
 
 #: The first columns of every ``episodes.csv``; a file with only these is complete.
 EPISODE_COLUMNS = ("global_step", "episodic_return", "episode_length")
@@ -48,6 +51,29 @@ METRIC_COLUMNS = ("global_step", "steps_per_second")
 VELOCITY_KEY = "x_velocity"
 #: How the names of the terms of the reward begin in an environment's ``info``.
 REWARD_PREFIX = "reward_"
+
+
+def ended_state(summary: Mapping[str, Any]) -> str | None:
+    """How a run ended by its ``summary.json``: one of ``ENDED``, whatever the program that wrote it calls that.
+
+    Args:
+        summary: The file's contents. Without a status it is of a run that came to its end, as the file is written last.
+
+    Returns:
+        None if its status is another word.
+    """
+    said = summary.get("status")
+    word = COMPLETE if said is None else str(said).strip().lower()
+    return COMPLETE if word in _FINISHED else word if word in ENDED else None
+
+
+def unended_reason(summary: Mapping[str, Any]) -> str:
+    """Why a run with a ``summary.json`` has not ended: it says so itself, or its status is no known word."""
+    said = str(summary.get("status"))
+    if said in (RUNNING, STOPPED):
+        return f"{SUMMARY_FILE} says that it is {said}"
+    known = ", ".join((*ENDED, RUNNING, STOPPED))
+    return f"{SUMMARY_FILE}: status {said[:40]!r} is not known; write one of {known}"
 
 
 class DamagedError(Exception):

@@ -21,13 +21,14 @@ from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
     DESCRIPTION_FILE,
-    ENDED,
     EPISODES_FILE,
     METRICS_FILE,
     SUMMARY_FILE,
     TENSOR_FILE,
     TRANSFER_FILE,
+    ended_state,
 )
+from acmr.run_folders import run_folders
 from acmr.text import size
 
 #: A file above this is compressed.
@@ -53,8 +54,8 @@ def publish(runs: Path, out: Path) -> tuple[list[Path], list[Path]]:
     Raises:
         PublishError: If there is nothing to publish, or ``out`` holds other results of a run; then nothing is written.
     """
-    found = {path.parent.relative_to(runs): _files(path.parent) for path in sorted(runs.glob(f"**/{SUMMARY_FILE}"))}
-    found = {run: files for run, files in found.items() if files}
+    folders = [folder.path for folder in run_folders(runs) if (folder.path / SUMMARY_FILE).is_file()]
+    found = {path.relative_to(runs): files for path in folders if (files := _files(path))}
     if not found:
         raise PublishError(f"{runs}: no run has come to its end there; make status says how far they are")
     for run, files in found.items():
@@ -78,7 +79,7 @@ def _files(run: Path) -> dict[str, bytes]:
         summary = json.loads((run / SUMMARY_FILE).read_text(encoding="utf-8"))
     except ValueError:
         raise PublishError(f"{run / SUMMARY_FILE}: cannot be read; move that run away, or make it anew") from None
-    if summary.get("status") not in ENDED:
+    if ended_state(summary) is None:
         return {}
     names = (*RECORDS, *(TEACHER if _teaches(summary) else ()))
     return dict(_packed(run / name) for name in names if (run / name).is_file())
@@ -86,7 +87,7 @@ def _files(run: Path) -> dict[str, bytes]:
 
 def _teaches(summary: dict[str, Any]) -> bool:
     cell = CELLS.get(str(summary.get("cell")))
-    return cell is not None and cell.teaches and summary["status"] == COMPLETE
+    return cell is not None and cell.teaches and ended_state(summary) == COMPLETE
 
 
 def _packed(path: Path) -> tuple[str, bytes]:

@@ -11,7 +11,8 @@ from typing import Any
 from acmr.cells import full_name
 from acmr.config import THRESHOLD, ExperimentConfig
 from acmr.envs import describe
-from acmr.records import COMPLETE, RUN_PATTERN, SUMMARY_FILE
+from acmr.records import COMPLETE, SUMMARY_FILE, ended_state
+from acmr.run_folders import run_folders
 from acmr.storage.json_files import read_json
 from sweeps.plan import Plan, PlannedRun
 from sweeps.view import Lengths
@@ -75,10 +76,10 @@ def estimate(plan: Plan, output_dir: Path, workers: int) -> Estimate:
 def _finished(output_dir: Path) -> dict[Path, dict[str, Any]]:
     """Summaries of complete runs, by directory."""
     found: dict[Path, dict[str, Any]] = {}
-    for path in output_dir.glob(f"{RUN_PATTERN}/{SUMMARY_FILE}"):
-        summary = read_json(path)
-        if summary is not None and summary.get("status") == COMPLETE:
-            found[path.parent] = summary
+    for folder in run_folders(output_dir.absolute()) if output_dir.is_dir() else ():
+        summary = read_json(folder.path / SUMMARY_FILE)
+        if summary is not None and ended_state(summary) == COMPLETE:
+            found[folder.path] = summary
     return found
 
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from acmr.config import HORIZON, THRESHOLD, ConfigError, ExperimentConfig
-from acmr.records import COMPLETE, ENDED
+from acmr.records import COMPLETE, ended_state
 from acmr.settings.compose import compose_config, parse
 from acmr.settings.errors import check_booleans
 from acmr.settings.run_spec import RunSpec, specify, teacher_spec
@@ -175,8 +175,8 @@ def _ended(spec: RunSpec) -> str | None:
     run_dir = RunDir(spec.directory)
     if not holds_run(run_dir, spec.config):
         return None
-    status = (run_dir.summary() or {}).get("status")
-    return str(status) if status in ENDED else None
+    summary = run_dir.summary()
+    return None if summary is None else ended_state(summary)
 
 
 def _difference(ours: Sequence[str], theirs: Sequence[str]) -> tuple[str, str]:

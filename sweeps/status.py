@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from acmr.command import command
-from acmr.records import CONFIG_FILE, FAILED, RUN_PATTERN, RUNNING, SEED_FOLDER, STATUS_FILE
+from acmr.records import CONFIG_FILE, FAILED, RUNNING, SEED_FOLDER, STATUS_FILE
+from acmr.run_folders import RunFolder, run_folders
 from acmr.text import duration
 from sweeps.folder import WAITING, State, SweepFolder, SweepRun, all_folders
 from sweeps.table import counts, make_console, reasons, run_table
@@ -19,13 +20,17 @@ from sweeps.view import BLOCKED, LOST, RunStatus, steps_ahead, view_entries, vie
 _BAD = (FAILED, LOST, BLOCKED)
 
 
-def all_runs(output_dir: Path) -> list[RunStatus]:
-    """Every run below a folder, and those that its latest sweep has not begun yet."""
-    planned = _planned(output_dir)
-    found = {path.parent for name in (CONFIG_FILE, STATUS_FILE) for path in output_dir.glob(f"{RUN_PATTERN}/{name}")}
-    views = {view.directory: view for view in planned}
-    for directory in found - set(views):
-        views[directory] = view_run(directory, f"{directory.parts[-3]}/{directory.parts[-2]}", _seed(directory))
+def all_runs(output_dir: Path, folders: Iterable[RunFolder]) -> list[RunStatus]:
+    """Every run below a folder, and those that its latest sweep has not begun yet.
+
+    Args:
+        output_dir: The folder, as an absolute path: what a run is called follows from where it lies.
+        folders: What :func:`~acmr.run_folders.run_folders` finds there.
+    """
+    views = {view.directory: view for view in _planned(output_dir)}
+    for folder in folders:
+        if _is_ours(folder) and not views.keys() & {folder.path, *folder.others}:
+            views[folder.path] = view_run(folder.path, _name(output_dir, folder.path), _seed(folder.path))
     return sorted(views.values(), key=lambda view: (view.directory.parts[:-1], view.seed))
 
 
@@ -38,7 +43,7 @@ def _planned(output_dir: Path) -> list[RunStatus]:
         for view in view_entries(output_dir, entries, [_state(folder, entry, alive) for entry in entries]):
             # What an older sweep never began is forgotten, what it saw fail is not.
             if folder is folders[-1] or alive or view.state != WAITING:
-                known[view.directory] = _with_profile(view)
+                known[view.directory] = replace(view, name=_name(output_dir, view.directory))
     return list(known.values())
 
 
@@ -49,8 +54,14 @@ def _state(folder: SweepFolder, entry: SweepRun, alive: bool) -> State:
     return state
 
 
-def _with_profile(view: RunStatus) -> RunStatus:
-    return replace(view, name=f"{view.directory.parts[-3]}/{view.directory.parts[-2]}")
+def _is_ours(folder: RunFolder) -> bool:
+    """Whether a folder was written by a run: episodes alone may come from anywhere."""
+    return any((folder.path / name).is_file() for name in (CONFIG_FILE, STATUS_FILE))
+
+
+def _name(output_dir: Path, directory: Path) -> str:
+    """Where a run lies, without its seed: ``paper/humanoid-none``."""
+    return directory.relative_to(output_dir).parent.as_posix()
 
 
 def _seed(directory: Path) -> int:
@@ -67,11 +78,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not output_dir.is_dir():
         print(f"{output_dir}: no runs there yet; python run.py trains one")
         return 0
-    views = all_runs(output_dir)
+    output_dir = output_dir.absolute()
+    folders = run_folders(output_dir)
+    views = all_runs(output_dir, folders)
     console = make_console()
     console.print(run_table(views, console))
     for line in reasons(views):
         console.print(line, soft_wrap=True)
+    for folder in folders:
+        if folder.problem:
+            console.print(f"{folder.path}: {folder.problem}", markup=False, soft_wrap=True)
     running = [view for view in views if view.state == RUNNING]
     speed = sum(view.speed for view in running)
     eta = f"; {speed:,.0f} steps/s, {duration(steps_ahead(views) / speed)} left" if speed else ""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from acmr.cells import full_name, stops
-from acmr.records import COMPLETE, DIVERGED, ENDED, FAILED, RUNNING, STOPPED, SUMMARY_FILE
+from acmr.records import COMPLETE, DIVERGED, FAILED, RUNNING, STOPPED, SUMMARY_FILE, ended_state, unended_reason
 from acmr.storage.json_files import read_json
 from acmr.storage.processes import is_alive
 from acmr.tracking.status_file import read_status
@@ -66,14 +66,17 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
         state: What the sweep that it belongs to knows of it.
     """
     summary = None if state and state.state == RUNNING else read_json(directory / SUMMARY_FILE)
-    if summary is not None and summary.get("status") in ENDED:
+    ended = None if summary is None else ended_state(summary)
+    if summary is not None and ended is not None:
         step, speed = int(summary.get("global_step") or 0), float(summary.get("steps_per_second") or 0)
-        state_now, met = summary["status"], summary.get("steps_to_threshold")
-        total = step if state_now == COMPLETE else int(summary.get("total_timesteps") or total)
-        return RunStatus(name, seed, directory, state_now, step, total, speed, summary.get("final_return"), met=met)
+        met = summary.get("steps_to_threshold")
+        total = step if ended == COMPLETE else int(summary.get("total_timesteps") or total)
+        return RunStatus(name, seed, directory, ended, step, total, speed, summary.get("final_return"), met=met)
     status = read_status(directory) or {}
     alive = status.get("state") == RUNNING and _is_alive(status)
     told, reason = _told(status, state or State(STOPPED), alive)
+    if summary is not None and not alive:
+        reason = reason or unended_reason(summary)
     return RunStatus(
         name=name,
         seed=seed,

@@ -32,6 +32,7 @@ from acmr.records import (
     TENSOR_FILE,
     TRANSFER_FILE,
     DamagedError,
+    ended_state,
 )
 from acmr.storage.durable import read_regular, remove, remove_leftovers, sync_folder, write_bytes
 from acmr.storage.json_files import read_json, replace_json, write_json
@@ -84,7 +85,7 @@ class RunDir:
     def is_complete(self) -> bool:
         """Whether the run came to its end."""
         summary = self.summary()
-        return summary is not None and summary.get("status") == COMPLETE
+        return summary is not None and ended_state(summary) == COMPLETE
 
     def stored_settings(self) -> dict[str, Any] | None:
         """The settings it was started with; None if there are none yet."""

@@ -12,10 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from acmr.records import EPISODE_COLUMNS, EPISODES_FILE, VELOCITY_COLUMN, DamagedError
-
-#: What a run's episodes may lie in; the first that is there is read.
-EPISODE_FILES = (EPISODES_FILE, f"{EPISODES_FILE}.gz")
+from acmr.records import EPISODE_COLUMNS, VELOCITY_COLUMN, DamagedError
 
 
 def read_episodes(path: Path) -> tuple[pd.DataFrame, list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,7 +59,10 @@ def identify(directory: Path, name: str, config: Mapping[str, Any], summary: Map
         cell = _cell_of(settings, name)
     else:
         cell = dict(_names()).get(full_name(name).lower())
-    match = SEED_FOLDER.fullmatch(directory.name)
+    # A link may have any name; what it leads to tells the seed.
+    match = SEED_FOLDER.fullmatch(directory.name) or SEED_FOLDER.fullmatch(
+        os.path.basename(os.path.realpath(directory))
+    )
     seed = summary.get("seed", settings.get("seed", int(match.group(1)) if match else None))
     return Identity(
         group=cell or name,

@@ -5,8 +5,6 @@ Nothing that lies in the runs folder vanishes: what cannot be used is listed wit
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,16 +13,14 @@ import numpy as np
 import pandas as pd
 
 from acmr.cells import CELLS, Cell, planned_cells
-from acmr.records import ENDED, SEED_FOLDER, SUMMARY_FILE
-from analysis.loading.episodes import EPISODE_FILES
+from acmr.records import ENDED
+from acmr.run_folders import run_folders
 from analysis.loading.identify import PAIRS
 from analysis.loading.read_run import DAMAGED, DUPLICATE, FOREIGN, no_episodes, read_run
 
 #: States of runs that have come to their end, and so enter the comparisons. A run that diverged will never reach the
 #: threshold: leaving it out would favor settings that break.
 COUNTED = (*ENDED, FOREIGN)
-#: Folders that hold other files of the same names (of W&B, Hydra).
-PASSED_OVER = ("wandb", "__pycache__")
 
 
 class InputError(ValueError):
@@ -90,7 +86,7 @@ def load(root: Path) -> RunSet:
     if not root.is_dir():
         what = "is no folder" if root.exists() else "there is no such folder"
         raise InputError(f"{root}: {what}; give one with runs, as in runs/paper (python run.py matrix=paper makes it)")
-    found = {run.row["run"]: run for run in (read_run(root, *place) for place in _run_directories(root))}
+    found = {run.row["run"]: run for run in (read_run(root, folder) for folder in run_folders(root))}
     runs = _runs_frame([run.row for run in found.values()])
     _one_profile(root, runs)
     _mark_duplicates(runs)
@@ -101,18 +97,6 @@ def load(root: Path) -> RunSet:
         configs={name: run.config for name, run in found.items() if run.config},
         summaries={name: run.summary for name, run in found.items() if run.summary},
     )
-
-
-def _run_directories(root: Path) -> Iterator[tuple[Path, str]]:
-    problems: list[OSError] = []
-    for folder, children, files in os.walk(root, onerror=problems.append):
-        children[:] = sorted(child for child in children if child not in PASSED_OVER and not child.startswith("."))
-        path = Path(folder)
-        if SEED_FOLDER.fullmatch(path.name) or {*EPISODE_FILES, SUMMARY_FILE} & set(files):
-            children.clear()
-            yield path, ""
-    for problem in problems:
-        yield Path(str(problem.filename)), f"cannot be read: {problem.strerror}"
 
 
 _RUN_COLUMNS = (

@@ -15,17 +15,23 @@ from acmr.records import (
     CONFIG_FILE,
     DIVERGED,
     EPISODE_COLUMNS,
+    EPISODE_FILES,
     EPISODES_FILE,
+    RUNNING,
     STATUS_FILE,
+    STOPPED,
     SUMMARY_FILE,
     VELOCITY_COLUMN,
     DamagedError,
+    ended_state,
+    unended_reason,
 )
-from analysis.loading.episodes import EPISODE_FILES, read_episodes
+from acmr.run_folders import RunFolder
+from analysis.loading.episodes import read_episodes
 from analysis.loading.identify import Identity, identify
 
 #: States of a run that is there, beside those that it says itself.
-FOREIGN, UNFINISHED, DAMAGED, DUPLICATE = "foreign", "unfinished", "damaged", "duplicate"
+FOREIGN, UNFINISHED, UNKNOWN, DAMAGED, DUPLICATE = "foreign", "unfinished", "unknown", "damaged", "duplicate"
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -47,14 +53,14 @@ class FoundRun:
     summary: dict[str, Any]
 
 
-def read_run(root: Path, directory: Path, problem: str = "") -> FoundRun:
+def read_run(root: Path, folder: RunFolder) -> FoundRun:
     """Reads one run; whatever is wrong with it becomes its state and reason.
 
     Args:
         root: The runs folder.
-        directory: The run's.
-        problem: Why the directory cannot be looked into.
+        folder: The run's.
     """
+    directory, problem = folder.path, folder.problem
     notes = [problem] if problem else []
     damaged = bool(problem)
     config, summary, frame = {}, {}, no_episodes()
@@ -74,6 +80,7 @@ def read_run(root: Path, directory: Path, problem: str = "") -> FoundRun:
     parent = Path(name).parent.as_posix() if directory != root else directory.resolve().parent.name
     identity = identify(directory, parent if parent != "." else root.resolve().name, config, summary)
     state, reasons = (DAMAGED, []) if damaged else _state(directory, identity, frame, config, summary, notes)
+    reasons += [f"also found as {other.relative_to(root).as_posix()}" for other in folder.others]
     row = {"run": name, **vars(identity), "state": state, "reason": "; ".join([*notes, *reasons])}
     return FoundRun(row | _measures(state, frame, config, summary), frame, config, summary)
 
@@ -122,6 +129,10 @@ def _ended_state(frame: pd.DataFrame, summary: dict[str, Any], notes: list[str])
         return DAMAGED, [f"{SUMMARY_FILE} counts {count} episodes, {EPISODES_FILE} {len(frame)}"]
     if count is None and notes and not len(frame):
         return DAMAGED, []
+    state = ended_state(summary)
+    if state is None:
+        unfinished = summary["status"] in (RUNNING, STOPPED)
+        return UNFINISHED if unfinished else UNKNOWN, [unended_reason(summary)]
     reasons = []
     if summary.get("cause"):
         reasons.append(f"at step {summary.get('step', '?')}: {summary['cause']}")
@@ -129,7 +140,7 @@ def _ended_state(frame: pd.DataFrame, summary: dict[str, Any], notes: list[str])
         reasons.append(f"resumed inexactly: {json.dumps(summary['inexact_resumes'])}")
     if summary.get("physics_warnings"):
         reasons.append(f"warnings of MuJoCo: {json.dumps(summary['physics_warnings'])}")
-    return str(summary.get("status", COMPLETE)), reasons
+    return state, reasons
 
 
 def _unfinished(directory: Path) -> str:

@@ -12,9 +12,8 @@ from typing import Any
 import jinja2
 import pandas as pd
 
-from acmr.records import CONFIG_FILE, LOG_FILE, SUMMARY_FILE
+from acmr.records import CONFIG_FILE, EPISODE_FILES, LOG_FILE, SUMMARY_FILE
 from analysis.analyze import Analysis
-from analysis.loading.episodes import EPISODE_FILES
 from analysis.loading.missing import matrix_command, profile_of
 from analysis.loading.setting_differences import setting_differences
 from analysis.loading.speed import METRICS_FILES

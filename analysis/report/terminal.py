@@ -62,8 +62,8 @@ def missing_lines(missing: Sequence[Missing], planned: int, command: str) -> lis
 
 
 def left_out_lines(runs: pd.DataFrame) -> list[str]:
-    """Runs that were found but do not count, with the reason."""
-    odd = runs[~runs["counted"] & (runs["state"] != UNFINISHED)]
+    """Runs that were found but do not count, with the reason; unfinished ones of a cell are among the missing."""
+    odd = runs[~runs["counted"] & ((runs["state"] != UNFINISHED) | runs["cell"].isna())]
     return [f"not used: {name} ({run['state']}): {run['reason']}" for name, run in odd.iterrows()]
 
 

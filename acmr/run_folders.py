@@ -1,0 +1,122 @@
+"""Which directories below a folder hold a run: the one search of the analysis, ``make status`` and ``make publish``.
+
+Standard library only, like :mod:`acmr.records`.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from acmr.records import EPISODE_FILES, SEED_FOLDER, SUMMARY_FILE
+
+#: Folders that hold other files of the same names (of W&B, Python); those whose name begins with a dot are, too.
+PASSED_OVER = ("wandb", "__pycache__")
+#: Files by which a directory of any name is known to hold a run.
+_SIGNS = {*EPISODE_FILES, SUMMARY_FILE}
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A directory that holds a run.
+
+    Attributes:
+        path: Where it lies, below the folder that was searched; by a symbolic link only if there is no other way to it.
+        problem: Why it cannot be looked into; empty if it can.
+        others: Further ways to the same directory.
+    """
+
+    path: Path
+    problem: str = ""
+    others: tuple[Path, ...] = ()
+
+
+def run_folders(root: Path) -> list[RunFolder]:
+    """Every run below a folder, each once, in the order of their paths.
+
+    A run's directory is called ``seed_<n>`` or holds episodes or a summary; no run is looked for within a ``seed_<n>``.
+    Symbolic links are followed, the root's own included. A link that leads nowhere, and a folder that cannot be read,
+    are listed with their problem, for there may be runs behind them.
+
+    Args:
+        root: The folder; may itself be a run's directory.
+    """
+    search = _Search()
+    search.look_into(root)
+    # A run goes by its own path rather than by a link's, so that links wait until all else has been seen.
+    while search.links:
+        links, search.links = sorted(search.links), []
+        for link in links:
+            search.follow(link)
+    return sorted(search.found.values(), key=lambda run: run.path)
+
+
+class _Search:
+    """Goes through folders, each once however many ways lead to it: links in a circle end there."""
+
+    def __init__(self) -> None:
+        self.found: dict[Path, RunFolder] = {}
+        self.links: list[Path] = []
+        self._seen: dict[tuple[int, int], Path] = {}
+
+    def look_into(self, top: Path) -> None:
+        """Finds the runs in a folder and below it; links are noted."""
+        waiting = [top]
+        while waiting:
+            folder = waiting.pop()
+            try:
+                waiting += self._look_at(folder)
+            except OSError as error:
+                self.found[folder] = RunFolder(folder, f"cannot be read: {error.strerror}")
+
+    def follow(self, link: Path) -> None:
+        """Finds the runs that a link leads to, or notes it with those that were found before."""
+        try:
+            first = self._seen.get(_identity(link))
+        except OSError as error:
+            reason = f"the link leads nowhere: {os.readlink(link)} ({error.strerror})"
+            self.found[link] = RunFolder(link, reason)
+            return
+        if first is None:
+            self.look_into(link)
+            return
+        # A link to a folder that it lies in itself is no way to anything.
+        if not link.is_relative_to(first):
+            known = [first] if first in self.found else [path for path in self.found if path.is_relative_to(first)]
+            for path in known:
+                run = self.found[path]
+                self.found[path] = replace(run, others=(*run.others, link / path.relative_to(first)))
+
+    def _look_at(self, folder: Path) -> list[Path]:
+        """Notes a folder if it holds a run; the folders in it that are to be looked into."""
+        identity = _identity(folder)
+        if identity in self._seen:
+            return []
+        self._seen[identity] = folder
+        with os.scandir(folder) as listing:
+            entries = sorted((entry for entry in listing if not _is_aside(entry.name)), key=lambda entry: entry.name)
+        is_seed = SEED_FOLDER.fullmatch(folder.name) is not None
+        if is_seed or _SIGNS & {entry.name for entry in entries}:
+            self.found[folder] = RunFolder(folder)
+        if is_seed:
+            return []
+        self.links += [Path(entry.path) for entry in entries if entry.is_symlink() and _may_hold_runs(entry)]
+        return [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
+
+
+def _is_aside(name: str) -> bool:
+    return name.startswith(".") or name in PASSED_OVER
+
+
+def _identity(folder: Path) -> tuple[int, int]:
+    status = os.stat(folder)
+    return status.st_dev, status.st_ino
+
+
+def _may_hold_runs(link: os.DirEntry[str]) -> bool:
+    """Whether a link leads to a folder, or nowhere: then nobody knows."""
+    with suppress(OSError):
+        return link.is_dir() or not os.path.exists(link.path)
+    return True
