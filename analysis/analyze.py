@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import pandas as pd
@@ -9,13 +10,17 @@ import pandas as pd
 from acmr.cells import REFERENCE
 from acmr.records import SUMMARY_FILE
 from analysis.loading.load import InputError, RunSet
-from analysis.loading.missing import Missing, missing_runs, planned_seeds
+from analysis.loading.missing import Missing, missing_runs, planned_seeds, profile_of
+from analysis.loading.read_run import SUPERSEDED
 from analysis.statistics.comparisons import check_reference, compare_cells, compare_groups
+from analysis.statistics.early_ends import settle
 from analysis.statistics.metrics import measure
 from analysis.statistics.summaries import cell_table
 
 #: The paper's threshold and count (section 4.2), for runs that do not say theirs.
 PAPER_THRESHOLD, PAPER_CONSECUTIVE = 4900.0, 5
+#: What is said where two runs that should be the same are not.
+DIFFERS = "their steps to threshold differ"
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,13 @@ class Analysis:
         return len(self.data.cells) * self.planned
 
     @property
+    def notices(self) -> list[str]:
+        """What a reader has to know first: groups that are biased, and runs that contradict each other."""
+        odd = self.measured[self.measured["reason"].str.contains(DIFFERS, regex=False)]
+        contradictions = [f"{name} ({run['state']}): {run['reason']}" for name, run in odd.iterrows()]
+        return [*dict.fromkeys(filter(None, self.measured["bias"])), *contradictions]
+
+    @property
     def comparisons(self) -> pd.DataFrame:
         """Rows of table 3 and of the other groups."""
         return pd.concat([self.table3, self.others], ignore_index=True) if len(self.others) else self.table3
@@ -74,14 +86,16 @@ def analyze(
     check_reference(reference, data.groups)
     limit = threshold if threshold is not None else _common(data, "threshold", PAPER_THRESHOLD)
     count = consecutive if consecutive is not None else int(_common(data, "consecutive", PAPER_CONSECUTIVE))
-    measured = measure(data, limit, count)
-    planned = len(planned_seeds(data.runs))
+    seeds = planned_seeds(data.runs)
+    measured = settle(measure(data, limit, count), seeds, profile_of(data))
+    planned = len(seeds)
+    told = threshold is None and consecutive is None
     return Analysis(
         data=data,
         threshold=limit,
         consecutive=count,
         reference=reference,
-        measured=_check_summaries(measured, threshold is None and consecutive is None),
+        measured=_check_superseded(_check_summaries(measured) if told else measured),
         cells=cell_table(measured, data.groups),
         table3=compare_cells(measured, reference, planned),
         others=compare_groups(measured, reference, planned),
@@ -97,14 +111,40 @@ def _common(data: RunSet, name: str, default: float) -> float:
     return float(values[0]) if values else default
 
 
-def _check_summaries(measured: pd.DataFrame, own: bool) -> pd.DataFrame:
+def _check_summaries(measured: pd.DataFrame) -> pd.DataFrame:
     """Says so where a run's summary tells other steps to threshold than its episodes do."""
-    if not own:
-        return measured
     told = measured["steps_in_summary"]
     odd = told.notna() & (told != measured["steps_to_threshold"])
     for name in measured.index[odd]:
         note = f"{SUMMARY_FILE} says {told[name]:,.0f} steps to threshold, its episodes say otherwise"
-        reason = measured.loc[name, "reason"]
-        measured.loc[name, "reason"] = f"{reason}; {note}" if reason else note
+        _add_reason(measured, name, note)
     return measured
+
+
+def _check_superseded(measured: pd.DataFrame) -> pd.DataFrame:
+    """Says so where a run that stopped at its threshold tells other steps to it than the run that counts in its place.
+
+    Both are the same run as far as both go; where they are not, one was made by another program or machine.
+    """
+    for name, run in measured[measured["state"] == SUPERSEDED].iterrows():
+        same = measured[(measured["group"] == run["group"]) & (measured["seed"] == run["seed"]) & measured["counted"]]
+        for kept, other in same.iterrows():
+            watched = min(run["horizon"], other["horizon"])
+            times = [_time_within(row, watched) for row in (run, other)]
+            if times[0] != times[1]:
+                _add_reason(measured, name, f"{DIFFERS}: {_steps(run)} here, {_steps(other)} in {kept}")
+    return measured
+
+
+def _time_within(run: pd.Series, steps: float) -> float | None:
+    """Steps to threshold as far as they lie within these steps."""
+    return None if run["censored"] or run["time"] > steps else float(run["time"])
+
+
+def _steps(run: pd.Series) -> str:
+    return f"{'not reached by ' if run['censored'] else ''}{run['time']:,.0f}"
+
+
+def _add_reason(measured: pd.DataFrame, name: Hashable, note: str) -> None:
+    row = measured.index == name
+    measured.loc[row, "reason"] = [f"{reason}; {note}" if reason else note for reason in measured.loc[row, "reason"]]

@@ -26,7 +26,8 @@ def run(options: argparse.Namespace) -> int:
     closing = [] if options.summary else _write(analysis, options)
     title = f"Steps to threshold {analysis.threshold:g} ({analysis.consecutive} episodes in a row), {profile_of(data)}"
     print_summary(analysis.cells, analysis.comparisons, title)
-    print("\n".join(["", *left_out_lines(analysis.measured), *lines, *closing]))
+    biases = dict.fromkeys(filter(None, analysis.measured["bias"]))
+    print("\n".join(["", *biases, *left_out_lines(analysis.measured), *lines, *closing]))
     return 0
 
 

@@ -13,15 +13,17 @@ import numpy as np
 import yaml
 
 from acmr.cells import CELLS, TARGET, run_name
+from acmr.config import STOP_KEYS
+from acmr.records import steps_to_threshold
 
 PAIRS = {"paper": ("humanoid", "armless_humanoid"), "quick": ("ant", "ant_three_legs")}
 HEADER = "global_step,episodic_return,episode_length,mean_forward_velocity,reward_forward,reward_survive"
 
 
-def run_directory(root: Path, cell: str, seed: int, profile: str = "paper") -> Path:
+def run_directory(root: Path, cell: str, seed: int, profile: str = "paper", **stop: object) -> Path:
     row = CELLS[cell]
     env = PAIRS[profile][row.role == TARGET]
-    return root / run_name(env, row.transfer, row.freeze, row.changes) / f"seed_{seed}"
+    return root / run_name(env, row.transfer, row.freeze, {**row.changes, **stop}) / f"seed_{seed}"
 
 
 def settings(cell: str, seed: int, profile: str, total: int, threshold: float) -> dict:
@@ -107,7 +109,8 @@ def write_run(
     **more: object,
 ) -> Path:
     """Lays out a run's directory as a run leaves it; ``summary=False``: unfinished; a dict: additions to it."""
-    directory = run_directory(root, cell, seed, profile)
+    stop = {key: more[key] for key in STOP_KEYS if more.get(key)}
+    directory = run_directory(root, cell, seed, profile, **stop)
     directory.mkdir(parents=True)
     config = settings(cell, seed, profile, total, threshold) | more
     (directory / "config.yaml").write_text(yaml.safe_dump(config))
@@ -136,6 +139,34 @@ def write_run(
             "machine": "node-1",
         }
         (directory / "summary.json").write_text(json.dumps(content | (summary if isinstance(summary, dict) else {})))
+    return directory
+
+
+def cut(rows: np.ndarray, threshold: float = 4900.0, after: float = np.inf) -> np.ndarray:
+    """The episodes of the same run if it stops at its threshold, or after so many steps."""
+    met = steps_to_threshold(rows[:, 0].tolist(), rows[:, 1].tolist(), threshold)
+    return rows[rows[:, 0] <= min(met.last if met else np.inf, after)]
+
+
+def write_cut(
+    root: Path, cell: str, seed: int, rows: np.ndarray, total: int, after: int | None = None, **more: object
+) -> Path:
+    """Lays out the run of these episodes as ``stop=threshold`` leaves it."""
+    threshold = float(more.get("threshold", 4900.0))
+    left = cut(rows, threshold, total if after is None else after)
+    met = steps_to_threshold(left[:, 0].tolist(), left[:, 1].tolist(), threshold)
+    said = {"stop": "threshold", "stop_after": after, "global_step": met.last if met else after or total}
+    said["steps_to_threshold"] = met.last if met else None
+    more = {"summary": said, "total": total, "stop": "threshold", "stop_after": after, **more}
+    return write_run(root, cell, seed, left, **more)
+
+
+def write_under_way(root: Path, cell: str, seed: int, step: int, total: int, after: int | None = None) -> Path:
+    """Lays out a run that stops at its threshold and has taken so many steps without meeting it."""
+    stop = {"stop": "threshold", "stop_after": after}
+    directory = write_run(root, cell, seed, rows_reaching(None, step), total=total, summary=False, **stop)
+    status = {"state": "running", "global_step": step, "total_timesteps": after or total}
+    (directory / "status.json").write_text(json.dumps(status))
     return directory
 
 

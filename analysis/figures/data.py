@@ -16,7 +16,7 @@ from acmr.records import COMPLETE, VELOCITY_COLUMN
 from analysis.figures.style import Palette
 from analysis.loading.read_run import FOREIGN, UNFINISHED
 from analysis.loading.speed import read_speed
-from analysis.statistics.metrics import rolling_mean
+from analysis.statistics.metrics import asymptotic_return, rolling_mean
 
 #: The paper's rolling average (figures 4 to 6), in episodes.
 PAPER_WINDOW = 50
@@ -62,6 +62,10 @@ class FigureData:
         """Those of the groups that have something to draw."""
         return [name for name in names if name in self.groups and len(self.drawn(name))]
 
+    def is_biased(self, group: str) -> bool:
+        """Whether of a group the fast runs have ended and others have not (:mod:`analysis.statistics.early_ends`)."""
+        return bool(self.runs.loc[self.runs["group"] == group, "bias"].any())
+
     @property
     def others(self) -> list[str]:
         """Groups that are no cells and have something to draw."""
@@ -98,12 +102,16 @@ def drawn_runs(runs: pd.DataFrame, group: str) -> pd.DataFrame:
     return counted if len(counted) else own[own["state"] == UNFINISHED]
 
 
-def default_window(runs: pd.DataFrame) -> int:
+def default_window(runs: pd.DataFrame, episodes: pd.DataFrame) -> int:
     """The paper's 50 episodes; fewer, down to 5, where those would span more than a twentieth of a run at its end.
 
     The paper's own runs end in episodes of 1,000 steps: 50 of them are a twentieth of a million.
     """
-    share = (runs["horizon"] / runs["final_length"]).median() / 20
+    lengths = {
+        name: asymptotic_return(own["global_step"], own["episode_length"])
+        for name, own in episodes.groupby("run", observed=True, sort=False)
+    }
+    share = (runs["watched"] / pd.Series(lengths, dtype=float).reindex(runs.index)).median() / 20
     return PAPER_WINDOW if np.isnan(share) else int(np.clip(round(share), 5, PAPER_WINDOW))
 
 
@@ -140,10 +148,18 @@ def learning_curves(runs: pd.DataFrame, episodes: pd.DataFrame, groups: list[str
 def mean_curve(curves: pd.DataFrame, group: str, quantity: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean over a group's seeds at each step: (steps, means), both (POINTS,).
 
-    A run that ends early (diverged, unfinished) leaves the mean where it ends.
+    A run that ends early (diverged, unfinished, stopped at its threshold) leaves the mean where it ends.
     """
     own = curves[curves["group"] == group].groupby("step")[quantity].mean()
     return own.index.to_numpy(dtype=float), own.to_numpy(dtype=float)
+
+
+def leaving(curves: pd.DataFrame, group: str, quantity: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points of :func:`mean_curve` that are the last before fewer seeds, but still some, are averaged."""
+    steps, values = mean_curve(curves, group, quantity)
+    seeds = curves[curves["group"] == group].groupby("step")[quantity].count().to_numpy()
+    last = np.flatnonzero((np.diff(seeds) < 0) & (seeds[1:] > 0))
+    return steps[last], values[last]
 
 
 def _resample(

@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter
 from acmr.cells import CELLS, SOURCE, TARGET
 from analysis.figures import rows, steps
 from analysis.figures.data import Draw, FigureData, FigureSpec, mean_curve
-from analysis.figures.parts import count_label, marker_style, short_steps, step_axis
+from analysis.figures.parts import count_label, mark_leaving, marker_style, short_steps, step_axis
 from analysis.figures.style import COLUMN, PALETTES, Palette
 
 
@@ -62,7 +62,8 @@ def _curve(axes: Axes, data: FigureData, palette: Palette, cell: str, color: obj
     style = marker_style(palette, cell, data.groups)
     runs = data.drawn(cell)
     label = count_label(data, cell)
-    if len(runs) and not runs["censored"].any():
+    mark_leaving(axes, data, cell, "episodic_return", color)
+    if len(runs) and not runs["censored"].any() and not data.is_biased(cell):
         mean = float(runs["steps_to_threshold"].mean())
         axes.axvline(mean, color=color, linestyle="--", linewidth=0.9, zorder=2)
         label += f", StT {short_steps(mean)}"
@@ -78,7 +79,7 @@ _FIRST_COLORS = ("blue", "orange")
 _HOW = (
     "Rolling averages over {window} episodes, averaged over the seeds; behind them the raw returns of the first seed "
     "(seed 1 unless it is missing); black: threshold; dashed: mean steps to threshold from the raw returns (StT; where "
-    "a seed never reached it, how many did)."
+    "a seed never reached it, how many did); open circles: where a seed's run ends and leaves the average."
 )
 
 #: What the paper's cells are compared with, and the cells of each environment.

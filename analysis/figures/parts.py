@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from acmr.cells import CELLS, SOURCE, TARGET
-from analysis.figures.data import MOST_OTHERS, POINTS, FigureData
+from analysis.figures.data import MOST_OTHERS, POINTS, FigureData, leaving
 from analysis.figures.style import COLUMN, Palette
 
 #: Height of a row, inches.
@@ -57,7 +57,15 @@ def count_label(data: FigureData, group: str) -> str:
     name = short_name(group)
     if not runs["counted"].any():
         return f"{name} (unfinished)"
-    return name if len(runs) >= data.planned else f"{name} ({len(runs)} of {data.planned})"
+    said = [f"{len(runs)} of {data.planned}"] if len(runs) < data.planned else []
+    said += ["biased"] if data.is_biased(group) else []
+    return f"{name} ({', '.join(said)})" if said else name
+
+
+def mark_leaving(axes: Axes, data: FigureData, group: str, quantity: str, color: object) -> None:
+    """Draws an open circle on a group's mean curve wherever a seed leaves it and others go on."""
+    steps, values = leaving(data.curves, group, quantity)
+    axes.plot(steps, values, "o", color=color, markerfacecolor="white", markersize=3, markeredgewidth=0.8, zorder=4)
 
 
 def marker_style(palette: Palette, group: str, groups: Sequence[str]) -> dict[str, Any]:

@@ -25,7 +25,8 @@ from analysis.statistics.two_samples import mean_interval
 
 _TRANSFER = (
     "Dots: seeds; lines: means. Initial: the first 10 episodes after the random actions; mean: area under the learning "
-    "curve by its steps; asymptotic: the last tenth of the run (Taylor and Stone, 2009)."
+    "curve by its steps; asymptotic: the last tenth of the run (Taylor and Stone, 2009). Runs that stopped at their "
+    "threshold have an initial return only."
 )
 
 
@@ -43,7 +44,7 @@ def steps_per_seed(data: FigureData, palette: Palette) -> Figure | None:
         if len(missed):
             style = {"color": color, "markersize": 4.5, "fillstyle": "none", "clip_on": False}
             axes.plot(missed, spread(row, len(missed)), ">", **style)
-        if len(values) and not len(missed):
+        if len(values) and not len(missed) and not data.is_biased(group):
             mean_bar(axes, row, float(values.mean()), mean_interval(values))
     axes.set(xlabel="steps to threshold", xlim=(0, data.horizon))
     step_axis(axes.xaxis)
@@ -90,7 +91,8 @@ def transfer_metrics(data: FigureData, palette: Palette) -> Figure | None:
             values = data.drawn(group)[column].dropna().to_numpy(dtype=float)
             color = palette.color(group, data.groups)
             axes.plot(values, spread(row, len(values)), "o", color=color, markersize=3.5, markeredgecolor="white")
-            axes.plot(values.mean() if len(values) else np.nan, row, "|", color="black", markersize=9)
+            mean = values.mean() if len(values) and not data.is_biased(group) else np.nan
+            axes.plot(mean, row, "|", color="black", markersize=9)
         axes.set_title(title, pad=3)
         axes.xaxis.set_major_locator(MaxNLocator(3))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short_steps(value)))
@@ -133,5 +135,10 @@ FIGURES = (
         differences,
     ),
     FigureSpec("transfer_metrics", "Initial, mean and asymptotic return", _TRANSFER, transfer_metrics, limited=True),
-    FigureSpec("wall_clock", "Cost", "Wall-clock time of each run (dots) and the mean (bars).", wall_clock),
+    FigureSpec(
+        "wall_clock",
+        "Cost",
+        "Wall-clock time of each run (dots), to where it stopped, and the mean (bars).",
+        wall_clock,
+    ),
 )

@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from acmr.cells import CELLS
 from acmr.records import VELOCITY_COLUMN
 from analysis.figures.data import MOST_OTHERS, FigureData, FigureSpec, mean_curve
-from analysis.figures.parts import count_label, finish, marker_style, stacked, step_axis, two_lines
+from analysis.figures.parts import count_label, finish, mark_leaving, marker_style, stacked, step_axis, two_lines
 from analysis.figures.style import COLUMN, Palette
 from analysis.loading.read_run import UNFINISHED
 from analysis.statistics.survival import kaplan_meier
@@ -51,6 +51,7 @@ def learning_bands(data: FigureData, palette: Palette) -> Figure | None:
         own = data.curves[data.curves["group"] == group]
         color = palette.color(group, data.groups)
         sns.lineplot(own, x="step", y="episodic_return", color=color, errorbar=("pi", 100), ax=axes, legend=False)
+        mark_leaving(axes, data, group, "episodic_return", color)
         axes.axhline(data.threshold, color="black", linewidth=0.7)
         axes.set_title(two_lines(count_label(data, group), 24), pad=2)
         axes.set(xlabel="", ylabel="", xlim=(0, data.horizon))
@@ -94,6 +95,7 @@ def _over_steps(data: FigureData, palette: Palette, quantity: str, label: str) -
     figure, panels = stacked([group for group in data.groups if group in recorded])
     for axes, groups in panels:
         for group in groups:
+            mark_leaving(axes, data, group, quantity, palette.color(group, data.groups))
             steps, values = mean_curve(data.curves, group, quantity)
             axes.plot(
                 steps,
@@ -105,6 +107,8 @@ def _over_steps(data: FigureData, palette: Palette, quantity: str, label: str) -
         axes.set_ylabel(label)
     return finish(figure, panels, data)
 
+
+_LEAVING = "open circles: where a seed's run ends and leaves the average"
 
 FIGURES = (
     FigureSpec(
@@ -118,21 +122,24 @@ FIGURES = (
     FigureSpec(
         "learning_curves",
         "Learning curves with bands",
-        "Rolling averages over {window} episodes: mean over the seeds, and from the lowest to the highest seed.",
+        "Rolling averages over {window} episodes: mean over the seeds, and from the lowest to the highest seed; "
+        f"{_LEAVING}.",
         learning_bands,
         limited=True,
     ),
     FigureSpec(
         "episode_length",
         "Episode length",
-        "Rolling averages over {window} episodes. Surviving an episode is most of what the threshold asks for.",
+        "Rolling averages over {window} episodes. Surviving an episode is most of what the threshold asks for. "
+        f"{_LEAVING.capitalize()}.",
         episode_length,
         limited=True,
     ),
     FigureSpec(
         "forward_velocity",
         "Forward velocity",
-        "Rolling averages over {window} episodes. An agent that stands still has a velocity of zero.",
+        "Rolling averages over {window} episodes. An agent that stands still has a velocity of zero. "
+        f"{_LEAVING.capitalize()}.",
         forward_velocity,
         limited=True,
     ),

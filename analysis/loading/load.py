@@ -16,7 +16,7 @@ from acmr.cells import CELLS, Cell, planned_cells
 from acmr.records import ENDED
 from acmr.run_folders import run_folders
 from analysis.loading.identify import PAIRS
-from analysis.loading.read_run import DAMAGED, DUPLICATE, FOREIGN, no_episodes, read_run
+from analysis.loading.read_run import DAMAGED, DUPLICATE, FOREIGN, SUPERSEDED, no_episodes, read_run
 
 #: States of runs that have come to their end, and so enter the comparisons. A run that diverged will never reach the
 #: threshold: leaving it out would favor settings that break.
@@ -36,8 +36,10 @@ class RunSet:
         runs: One row a run, indexed by its path below the root: ``group, cell, seed, profile, env, transfer, freeze``
             (see :class:`~analysis.loading.identify.Identity`), ``state`` and ``reason``, ``counted`` (enters
             comparisons), ``episodes`` (number), ``last_step`` (end of the last episode), ``horizon`` (step up to which
-            the run is known not to have reached the threshold, if it has not), ``learning_starts``, ``threshold``,
-            ``consecutive``, ``wall_seconds``, ``steps_per_second``.
+            the run is known not to have reached the threshold, if it has not), ``cut`` (ends at its own threshold, as
+            ``stop=threshold`` has it, before its last step), ``stop_after`` (step at which such a run ends at the
+            latest), ``total_timesteps``, ``learning_starts``, ``threshold``, ``consecutive``, ``wall_seconds``,
+            ``steps_per_second``.
         episodes: One row an episode: ``run, group, seed`` and the columns of ``episodes.csv``; steps ascend within a
             run.
         configs: The settings of each run that has them.
@@ -101,7 +103,8 @@ def load(root: Path) -> RunSet:
 
 _RUN_COLUMNS = (
     *("run", "group", "cell", "seed", "profile", "env", "transfer", "freeze", "state", "reason"),
-    *("episodes", "last_step", "horizon", "total_timesteps", "learning_starts", "threshold", "consecutive"),
+    *("episodes", "last_step", "horizon", "cut"),
+    *("total_timesteps", "stop_after", "learning_starts", "threshold", "consecutive"),
     *("wall_seconds", "steps_per_second", "steps_in_summary"),
 )
 _FLOATS = _RUN_COLUMNS[_RUN_COLUMNS.index("total_timesteps") :]
@@ -109,7 +112,7 @@ _FLOATS = _RUN_COLUMNS[_RUN_COLUMNS.index("total_timesteps") :]
 
 def _runs_frame(rows: list[dict[str, Any]]) -> pd.DataFrame:
     frame = pd.DataFrame(rows, columns=list(_RUN_COLUMNS))
-    frame = frame.astype({**dict.fromkeys(_FLOATS, "float64"), "seed": "Int64"})
+    frame = frame.astype({**dict.fromkeys(_FLOATS, "float64"), "seed": "Int64", "cut": "bool"})
     frame = frame.astype(dict.fromkeys(("episodes", "last_step", "horizon"), "int64"))
     position = {cell: index for index, cell in enumerate(CELLS)}
     frame["order"] = [position.get(group, len(position)) for group in frame["group"]]
@@ -128,14 +131,24 @@ def _one_profile(root: Path, runs: pd.DataFrame) -> None:
 
 
 def _mark_duplicates(runs: pd.DataFrame) -> None:
-    """Of several directories that claim one group and seed, only one may count: a finished one, else the first."""
+    """Of several directories that claim one group and seed, only one may count.
+
+    A finished one does, of those the full one, of cut ones the one that was watched longest, else the first.
+    """
     for _, same in runs[runs["state"] != DAMAGED].groupby(["group", "seed"]):
         if len(same) > 1:
-            kept = same.sort_values("counted", ascending=False, kind="stable").index[0]
-            others = [name for name in same.index if name != kept]
-            runs.loc[others, "state"] = DUPLICATE
-            runs.loc[others, "reason"] = f"{kept} is the same group and seed"
-            runs.loc[others, "counted"] = False
+            watched = same["horizon"].where(same["cut"], 0)
+            ranks = same.assign(full=~same["cut"], watched=watched, limit=same["stop_after"].fillna(np.inf))
+            by = ["counted", "full", "watched", "limit"]
+            kept = ranks.sort_values(by, ascending=False, kind="stable").index[0]
+            others = same[same.index != kept]
+            # Both are the same run as far as the cut one goes: nothing is lost by leaving that out.
+            superseded = others["counted"] & others["cut"]
+            what = "longer" if runs.loc[kept, "cut"] else "full"
+            reasons = [f"{kept} is the {what} run of the same" if cut else f"{kept} is the same" for cut in superseded]
+            runs.loc[others.index, "state"] = np.where(superseded, SUPERSEDED, DUPLICATE)
+            runs.loc[others.index, "reason"] = [f"{reason} group and seed" for reason in reasons]
+            runs.loc[others.index, "counted"] = False
 
 
 def _episodes_frame(runs: pd.DataFrame, frames: dict[str, pd.DataFrame]) -> pd.DataFrame:

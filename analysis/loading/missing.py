@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from acmr.config import THRESHOLD
 from analysis.loading.load import RunSet
 from analysis.loading.read_run import DAMAGED
 
@@ -49,8 +50,27 @@ def missing_runs(data: RunSet) -> list[Missing]:
             if not there["counted"].any():
                 state = str(there["state"].iloc[0]) if len(there) else "missing"
                 force = " force=true" if state == DAMAGED else ""
-                found.append(Missing(cell, seed, state, f"python run.py experiment={cell} seed={seed}{option}{force}"))
+                # A run that is there goes on as it began; one that is not ends as the others of its cell do.
+                stop = stop_words(there if len(there) else runs[runs["cell"] == cell])
+                line = f"python run.py experiment={cell} seed={seed}{option}{stop}{force}"
+                found.append(Missing(cell, seed, state, line))
     return found
+
+
+def stop_words(runs: pd.DataFrame) -> str:
+    """What is typed so that a run ends as those of these that stop at their threshold; empty if none does."""
+    limits = runs.loc[runs["cut"], "stop_after"]
+    if limits.empty:
+        return ""
+    return f" stop={THRESHOLD}" + ("" if pd.isna(limits.max()) else f" stop_after={limits.max():.0f}")
+
+
+def command_for(runs: pd.DataFrame, seeds: Iterable[int], profile: str) -> str:
+    """The command that makes these seeds of a cell as its runs here were made; empty for what is no cell."""
+    cell = runs["cell"].iloc[0]
+    if pd.isna(cell):
+        return ""
+    return f"python run.py matrix={profile} experiment={cell} seed={_list(seeds)}{stop_words(runs)}"
 
 
 def profile_of(data: RunSet) -> str:
@@ -65,6 +85,11 @@ def profile_of(data: RunSet) -> str:
 def matrix_command(data: RunSet) -> str:
     """The one command that makes all that is missing and leaves alone what is complete."""
     words, seeds = [f"python run.py matrix={profile_of(data)}"], planned_seeds(data.runs)
+    stop, missing = stop_words(data.runs[data.runs["cell"].notna()]), missing_runs(data)
+    if stop and missing:
+        # Only what is missing is named: what is complete may have been made with another stop_after.
+        cells, lacking = dict.fromkeys(run.cell for run in missing), sorted({run.seed for run in missing})
+        return f"{words[0]} experiment={_list(cells)} seed={_list(lacking)}{stop}"
     if not all(cell.published for cell in data.cells):
         words.append(f"experiment={_list(cell.name for cell in data.cells)}")
     if tuple(seeds) != PAPER_SEEDS:

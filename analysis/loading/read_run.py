@@ -10,6 +10,8 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from acmr.cells import stops
+from acmr.config import THRESHOLD
 from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
@@ -32,6 +34,8 @@ from analysis.loading.identify import Identity, identify
 
 #: States of a run that is there, beside those that it says itself.
 FOREIGN, UNFINISHED, UNKNOWN, DAMAGED, DUPLICATE = "foreign", "unfinished", "unknown", "damaged", "duplicate"
+#: A run that stopped at its threshold, of which there is a longer one.
+SUPERSEDED = "superseded"
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -82,7 +86,12 @@ def read_run(root: Path, folder: RunFolder) -> FoundRun:
     state, reasons = (DAMAGED, []) if damaged else _state(directory, identity, frame, config, summary, notes)
     reasons += [f"also found as {other.relative_to(root).as_posix()}" for other in folder.others]
     row = {"run": name, **vars(identity), "state": state, "reason": "; ".join([*notes, *reasons])}
-    return FoundRun(row | _measures(state, frame, config, summary), frame, config, summary)
+    row |= _measures(state, frame, config, summary) | _stop(name, frame, config, summary)
+    if state == DIVERGED and not pd.isna(row["stop_after"]):
+        row["horizon"] = int(row["stop_after"])  # it would not have been watched any longer
+    elif state == UNFINISHED:
+        row["horizon"] = max(row["horizon"], _steps_said(directory))
+    return FoundRun(row, frame, config, summary)
 
 
 def _mapping_of(path: Path) -> dict[str, Any]:
@@ -173,6 +182,25 @@ def _measures(
         "steps_per_second": _number(summary.get("steps_per_second")),
         "steps_in_summary": _number(summary.get("steps_to_threshold")),
     }
+
+
+def _stop(name: str, frame: pd.DataFrame, config: dict[str, Any], summary: dict[str, Any]) -> dict[str, Any]:
+    """Whether a run ends at its own threshold before its last step, and when it does at the latest."""
+    said = summary.get("stop", config.get("stop"))
+    stopping = stops(name) if said is None else said == THRESHOLD
+    total = _number(summary.get("total_timesteps", config.get("total_timesteps")))
+    end = _number(summary.get("global_step")) or (frame["global_step"].iloc[-1] if len(frame) else 0)
+    after = _number(summary.get("stop_after", config.get("stop_after")))
+    return {"cut": stopping and (total is None or end < total), "stop_after": after if stopping else None}
+
+
+def _steps_said(directory: Path) -> int:
+    """Steps that a run under way says it has taken: without an episode's end among them, it has not reached by then."""
+    try:
+        said = _mapping_of(directory / STATUS_FILE).get("global_step")
+    except DamagedError:
+        return 0
+    return said if isinstance(said, int) and 0 < said < 2**53 else 0
 
 
 def _number(value: Any) -> float | None:

@@ -19,7 +19,7 @@ from analysis.loading.setting_differences import setting_differences
 from analysis.loading.speed import METRICS_FILES
 from analysis.report import prose
 from analysis.report.published import published_table3
-from analysis.report.tables import heading, readable
+from analysis.report.tables import heading, marked, readable
 
 #: Files of a run that are linked where they are there.
 RUN_FILES = (*EPISODE_FILES, *METRICS_FILES, CONFIG_FILE, SUMMARY_FILE, LOG_FILE)
@@ -117,7 +117,7 @@ def write_report(report: Report, out: Path) -> Path:
 
 
 def _table(frame: pd.DataFrame, columns: Sequence[str] | None = None) -> Table:
-    shown = frame if columns is None else frame[list(columns)]
+    shown = marked(frame) if columns is None else marked(frame)[list(columns)]
     text = readable(shown, missing="–")
     numeric = [bool(pd.api.types.is_numeric_dtype(shown[name])) for name in shown.columns]
     return Table([str(name) for name in shown.columns], text.to_numpy().tolist(), numeric)
@@ -125,7 +125,7 @@ def _table(frame: pd.DataFrame, columns: Sequence[str] | None = None) -> Table:
 
 def _detailed(table3: pd.DataFrame) -> Table:
     """Table 3 turned on its side: a column for each comparison, for it has too many numbers to lie."""
-    text = readable(table3, missing="–")
+    text = readable(marked(table3), missing="–")
     heads = [f"{index} − {reference}" for index, reference in zip(text["index"], text["reference"], strict=True)]
     names = [name for name in text.columns if name not in ("reference", "index", "note")]
     rows = [[heading(name), *text[name]] for name in names]

@@ -19,9 +19,10 @@ def about_n(table3: pd.DataFrame, cells: Sequence[Cell]) -> list[str]:
         table3: Rows with ``runs_reference`` and ``runs_index``.
         cells: The cells that there should be.
     """
-    sizes = [(int(a), int(b)) for a, b in zip(table3["runs_reference"], table3["runs_index"], strict=True) if a and b]
+    tested = table3[~table3["biased_reference"] & ~table3["biased_index"]]
+    sizes = [(int(a), int(b)) for a, b in zip(tested["runs_reference"], tested["runs_index"], strict=True) if a and b]
     if not sizes:
-        return ["No two groups have complete runs yet: nothing can be compared."]
+        return ["No two groups have runs that can be compared yet."]
     n, m = min(sizes, key=lambda pair: (sum(pair), pair))
     if min(n, m) < 2:
         return [
@@ -80,7 +81,15 @@ def how_runs_count(consecutive: int) -> list[str]:
         "threshold. One number a run; a run, not an episode, is the unit of every test.",
         "Comparisons take the runs that came to their end. An unfinished run is listed, with its steps to threshold if "
         "it has reached it, but does not enter means and tests: of unfinished runs the fast ones are known first, and "
-        "a cell would look faster than it is. The Kaplan-Meier curves include it, censored at its last episode.",
+        "a cell would look faster than it is. The Kaplan-Meier curves include it, censored at its latest step.",
+        "A run that stopped at its threshold (stop=threshold) is the beginning of a full one: it counts with its steps "
+        "to threshold, or as not reached by stop_after. What comes after its end is not known: it has no asymptotic "
+        "return and no area under the curve, its curve ends, and where a full run of its seed lies beside it, that one "
+        "counts. Asked for a higher threshold than its own it counts as not reached by its end.",
+        "While such runs are under way the fast ones have ended and the slow ones have not. A group enters means and "
+        "tests once every planned seed has ended or is past the slowest that has (it then counts as not reached by its "
+        "latest step); failing that with the paper's seeds alone, if these are known; failing that it is biased: "
+        "described, marked and not tested.",
         "A run that diverged will never reach the threshold: it counts as not reached over its whole length (or with "
         "its steps to threshold, if it diverged later).",
         "Where some runs of a cell never reached the threshold, its mean is of the others, and no t-test is made, "

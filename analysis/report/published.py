@@ -56,6 +56,8 @@ def side_by_side(table3: pd.DataFrame) -> pd.DataFrame:
 def _agreement(t: float, p: float, ours: Mapping[Hashable, Any]) -> tuple[str, str, str]:
     if min(ours["runs_reference"], ours["runs_index"]) == 0:
         return "-", "-", "not run yet"
+    if ours["biased_reference"] or ours["biased_index"]:
+        return "-", "-", "biased: only its fast runs have ended"
     if pd.isna(t):
         reached, runs = ours["n_index"], ours["runs_index"]
         if not reached:

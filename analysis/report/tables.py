@@ -35,7 +35,7 @@ def write_table(table: pd.DataFrame, out: Path, name: str, caption: str, columns
         columns: Those for Markdown and LaTeX; None: all.
     """
     table.to_csv(out / f"{name}.csv", index=False, na_rep="NaN", lineterminator="\n")
-    shown = readable(table if columns is None else table[columns])
+    shown = readable(marked(table) if columns is None else marked(table)[columns])
     alignment = ["left" if name in _text_columns(table) else "right" for name in shown.columns]
     shown.columns = pd.Index([heading(str(name)) for name in shown.columns])
     markdown = shown.to_markdown(index=False, disable_numparse=True, colalign=alignment)
@@ -69,6 +69,15 @@ def _with_minus(text: object) -> str:
 
 def _stacked(words: str, side: str) -> str:
     return rf"\shortstack[{side}]{{{words.replace(' ', chr(92) * 2)}}}" if " " in words else words
+
+
+def marked(table: pd.DataFrame) -> pd.DataFrame:
+    """The table as it is shown: with a word after the name of each group that is biased."""
+    table = table.copy()
+    for name, flag in (("reference", "biased_reference"), ("index", "biased_index"), ("group", "biased")):
+        if flag in table:
+            table[name] = table[name].where(~table[flag].astype(bool), table[name] + " (biased)")
+    return table
 
 
 def readable(table: pd.DataFrame, missing: str = "NaN") -> pd.DataFrame:

@@ -39,7 +39,8 @@ def print_summary(cells: pd.DataFrame, comparisons: pd.DataFrame, title: str, co
             values = (_decimal(test[name]) for name in ("t_score", "p_value", "p_log_rank"))
             numbers = [test["reference"], *values]
         reached = f"{row['reached']} of {row['runs']}"
-        table.add_row(escape(row["group"]), reached, _steps(row["mean"]), _steps(row["std"]), *numbers)
+        name = f"{row['group']} (biased)" if row["biased"] else row["group"]
+        table.add_row(escape(name), reached, _steps(row["mean"]), _steps(row["std"]), *numbers)
     console.print(f"[bold]{escape(title)}[/bold]")
     console.print(table)
 

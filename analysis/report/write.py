@@ -99,7 +99,7 @@ def _write_tables(analysis: Analysis, out: Path, written: Written) -> dict[str, 
 def _write_figures(analysis: Analysis, out: Path, options: argparse.Namespace, written: Written) -> list[Picture]:
     apply()
     measured, data = analysis.measured, analysis.data
-    window = options.window or default_window(measured)
+    window = options.window or default_window(measured, data.episodes)
     drawing = FigureData(
         runs=measured,
         episodes=data.episodes,

@@ -1,7 +1,7 @@
 """Two groups of runs -> one row of table 3.
 
 Only runs that have come to their end enter (``counted``): of the unfinished ones, the fast ones would be known first,
-and a cell would look faster than it is.
+and a cell would look faster than it is. A group of which that may still be so (``bias``) is described and not tested.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from acmr.cells import CELLS, REFERENCE, TARGET, planned_cells
+from acmr.records import COMPLETE
 from analysis.loading.load import InputError
 from analysis.statistics.survival import log_rank, restricted_mean
 from analysis.statistics.two_samples import (
@@ -40,7 +41,7 @@ COLUMNS = [
     *("hedges_g", "hedges_g_low", "hedges_g_high", "power_large_effect", "detectable_effect"),
     *("runs_reference", "runs_index", "censored_reference", "censored_index", "horizon"),
     *("restricted_mean_reference", "restricted_mean_index", "restricted_difference", "p_restricted"),
-    *("log_rank_z", "p_log_rank_asymptotic", "p_log_rank", "note"),
+    *("log_rank_z", "p_log_rank_asymptotic", "p_log_rank", "biased_reference", "biased_index", "note"),
 ]
 
 
@@ -91,7 +92,9 @@ def compare(runs: pd.DataFrame, reference: str, index: str, planned: int = 3) ->
     first, second = _counted(runs, reference), _counted(runs, index)
     a, b = _reached(first), _reached(second)
     row: dict[str, Any] = {"reference": reference, "index": index, **_describe(a, "reference"), **_describe(b, "index")}
-    if not (first["censored"].any() or second["censored"].any()):
+    row |= {"biased_reference": bool(bias(first)), "biased_index": bool(bias(second))}
+    testable = not (bias(first) or bias(second))
+    if testable and not (first["censored"].any() or second["censored"].any()):
         row |= _tests(a, b)
     row |= {
         "power_large_effect": power(LARGE_EFFECT, len(first), len(second)),
@@ -99,8 +102,10 @@ def compare(runs: pd.DataFrame, reference: str, index: str, planned: int = 3) ->
     }
     for frame, role in ((first, "reference"), (second, "index")):
         row |= {f"runs_{role}": len(frame), f"censored_{role}": int(frame["censored"].sum())}
-    row |= _censored(first, second)
-    row["note"] = "; ".join(_notes(reference, first, planned) + _notes(index, second, planned) + _doubts(first, second))
+    if testable:
+        row |= _censored(first, second)
+    doubts = _doubts(first, second) if testable else []
+    row["note"] = "; ".join(_notes(reference, first, planned) + _notes(index, second, planned) + doubts)
     return row
 
 
@@ -109,6 +114,7 @@ def _compare(runs: pd.DataFrame, pairs: list[tuple[str, str]], planned: int) -> 
     text = {"reference", "index", "note"}
     whole = {f"{what}_{role}" for what in ("n", "runs", "censored") for role in ("reference", "index")}
     kinds = {column: "int64" if column in whole else "float64" for column in COLUMNS if column not in text}
+    kinds |= dict.fromkeys(("biased_reference", "biased_index"), "bool")
     table = table.astype(kinds)
     asked = (table["runs_reference"] > 0) & (table["runs_index"] > 0)
     families = pd.Series([CELLS[index].family if index in CELLS else _OTHERS for index in table["index"]], dtype=object)
@@ -159,7 +165,7 @@ def _tests(reference: NDArray[np.float64], index: NDArray[np.float64]) -> dict[s
 def _censored(first: pd.DataFrame, second: pd.DataFrame) -> dict[str, float]:
     if not (len(first) and len(second)):
         return {}
-    horizon = float(min(first["horizon"].min(), second["horizon"].min()))
+    horizon = common_horizon(pd.concat([first, second]))
     times = [frame["time"].to_numpy(dtype=float) for frame in (first, second)]
     reached = [~frame["censored"].to_numpy(dtype=bool) for frame in (first, second)]
     means = [restricted_mean(*sample, horizon) for sample in zip(times, reached, strict=True)]
@@ -176,10 +182,30 @@ def _censored(first: pd.DataFrame, second: pd.DataFrame) -> dict[str, float]:
     }
 
 
+def bias(runs: pd.DataFrame) -> str:
+    """Why these runs of one group cannot be tested yet, and what to type; empty if they can."""
+    return next(iter(runs["bias"]), "")
+
+
+def common_horizon(runs: pd.DataFrame) -> float:
+    """Steps up to which all of these runs were watched, or would have been if they had not reached; n >= 1."""
+    watched = runs["watched"].min()
+    return float(runs["time"].max() if pd.isna(watched) else watched)
+
+
 def _notes(name: str, runs: pd.DataFrame, planned: int) -> list[str]:
     notes, n, missed = [], len(runs), int(runs["censored"].sum())
     if n == 0:
         return [f"{name}: no complete run"]
+    if bias(runs):
+        return [bias(runs)]
+    own = runs["stop_after"].fillna(runs["total_timesteps"])
+    early = int((runs["cut"] & runs["censored"] & (runs["state"] == COMPLETE) & (runs["horizon"] < own)).sum())
+    if early:
+        notes.append(
+            f"{name}: {early} of {n} runs stopped at a threshold of their own before they met this one, and are "
+            "censored there, the fast ones soonest: tests take censoring for independent of speed"
+        )
     if n < planned:
         notes.append(f"{name}: {n} of {planned} runs")
     if missed == n:
@@ -194,7 +220,7 @@ def _notes(name: str, runs: pd.DataFrame, planned: int) -> list[str]:
 def _doubts(first: pd.DataFrame, second: pd.DataFrame) -> list[str]:
     notes = []
     both = pd.concat([first, second])
-    if both["horizon"].nunique() > 1:
+    if both["watched"].nunique() > 1:
         notes.append("runs of unequal length: the log-rank p-value is approximate")
     spread = [_reached(frame) for frame in (first, second)]
     if min(map(len, spread)) > 1 and not both["censored"].any() and all(np.ptp(sample) == 0 for sample in spread):

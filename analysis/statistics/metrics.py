@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from acmr.records import VELOCITY_COLUMN, steps_to_threshold
 from analysis.loading.load import RunSet
+from analysis.loading.read_run import UNFINISHED
 
 #: Episodes over which a run's initial performance is averaged.
 INITIAL_EPISODES = 10
@@ -136,8 +137,10 @@ def measure(data: RunSet, threshold: float, consecutive: int) -> pd.DataFrame:
 
     Returns:
         The runs' frame with the columns ``steps_to_threshold``, ``steps_to_threshold_first`` (NaN if not reached),
-        ``censored``, ``time`` (steps to threshold, or the horizon if censored), ``initial_return``,
-        ``asymptotic_return``, ``area_under_curve``, ``final_length`` (steps), ``final_velocity`` (m/s).
+        ``censored``, ``time`` (steps to threshold, or the horizon if censored), ``watched`` (step up to which the run
+        was watched, or would have been had it not reached; NaN: not known), ``initial_return``,
+        ``asymptotic_return``, ``area_under_curve``, ``final_length`` (steps), ``final_velocity`` (m/s), and ``bias``,
+        empty (:func:`analysis.statistics.early_ends.settle` fills it).
     """
     rows: dict[str, dict[str, Any]] = {}
     starts = data.runs["learning_starts"].fillna(0.0).to_dict()
@@ -148,13 +151,21 @@ def measure(data: RunSet, threshold: float, consecutive: int) -> pd.DataFrame:
     runs = data.runs.join(measured)
     runs["censored"] = runs["steps_to_threshold"].isna()
     runs["time"] = runs["steps_to_threshold"].fillna(runs["horizon"].astype(float))
+    # Once it has reached the threshold a run needs no more watching: that it ends then, or has come no further yet,
+    # makes nobody's horizon shorter.
+    limit = runs["stop_after"].fillna(runs["total_timesteps"])
+    whole = ~runs["cut"] & (runs["state"] != UNFINISHED)
+    runs["watched"] = runs["horizon"].astype(float).where(whole | runs["censored"], limit)
+    # Of what comes after a run was cut short nothing is known; and an area over fewer steps, those up to its success,
+    # is no measure of the same thing.
+    runs.loc[runs["cut"], list(END_MEASURES)] = float("nan")
+    runs["bias"] = ""
     return runs
 
 
-_MEASURES = [
-    *("steps_to_threshold", "steps_to_threshold_first", "initial_return"),
-    *("asymptotic_return", "area_under_curve", "final_length", "final_velocity"),
-]
+#: What only a run that took all its steps can tell.
+END_MEASURES = ("asymptotic_return", "area_under_curve", "final_length", "final_velocity")
+_MEASURES = ["steps_to_threshold", "steps_to_threshold_first", "initial_return", *END_MEASURES]
 
 
 def _measure_run(episodes: pd.DataFrame, start: float, threshold: float, consecutive: int) -> dict[str, float]:

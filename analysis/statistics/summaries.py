@@ -7,6 +7,7 @@ import pandas as pd
 
 from acmr.cells import CELLS, REFERENCE, SOURCE, TARGET
 from analysis.loading.load import RunSet
+from analysis.statistics.comparisons import bias, common_horizon
 from analysis.statistics.metrics import jumpstart, transfer_ratio
 from analysis.statistics.survival import restricted_mean
 from analysis.statistics.two_samples import mean_interval
@@ -59,16 +60,17 @@ def cell_table(runs: pd.DataFrame, groups: list[str]) -> pd.DataFrame:
 
     Returns:
         ``group, runs, reached, mean, std, low, high`` (95% t-interval of the mean; mean and the rest only of the runs
-        that reached the threshold, the interval only if all did), ``restricted_mean``, ``hours`` (mean wall-clock).
+        that reached the threshold, the interval only if all did), ``restricted_mean``, ``hours`` (mean wall-clock), and
+        ``biased`` (its fast runs ended first and others have not: no interval and no restricted mean).
     """
     rows = []
     for group in groups:
         own = runs[(runs["group"] == group) & runs["counted"]]
         values = own["steps_to_threshold"].dropna().to_numpy(dtype=float)
-        low, high = mean_interval(values) if len(values) == len(own) else (np.nan, np.nan)
-        within = (
-            restricted_mean(own["time"], ~own["censored"].astype(bool), own["horizon"].min()) if len(own) else np.nan
-        )
+        usable = len(own) and not bias(own)
+        low, high = mean_interval(values) if usable and len(values) == len(own) else (np.nan, np.nan)
+        reached = ~own["censored"].astype(bool)
+        within = restricted_mean(own["time"], reached, common_horizon(own)) if usable else np.nan
         rows.append(
             {
                 "group": group,
@@ -80,14 +82,18 @@ def cell_table(runs: pd.DataFrame, groups: list[str]) -> pd.DataFrame:
                 "high": high,
                 "restricted_mean": within,
                 "hours": own["wall_seconds"].mean() / 3600,
+                "biased": bool(bias(own)),
             }
         )
-    columns = ["group", "runs", "reached", "mean", "std", "low", "high", "restricted_mean", "hours"]
+    columns = ["group", "runs", "reached", "mean", "std", "low", "high", "restricted_mean", "hours", "biased"]
     return pd.DataFrame(rows, columns=columns)
 
 
 def transfer_table(runs: pd.DataFrame, groups: list[str], reference: str = REFERENCE) -> pd.DataFrame:
     """The metrics of Taylor and Stone (2009) by group: means over its counted runs, and against its baseline.
+
+    Runs that stopped at their threshold have an initial return only; ``full_runs`` counts the others. A biased group
+    has no means.
 
     Args:
         runs: The runs with their metrics.
@@ -95,7 +101,9 @@ def transfer_table(runs: pd.DataFrame, groups: list[str], reference: str = REFER
         reference: Baseline of the groups that are no cells, and of the cells whose baseline is A0.
     """
     columns = ["initial_return", "asymptotic_return", "area_under_curve"]
-    table = runs[runs["counted"]].groupby("group")[columns].mean()
+    used = runs[runs["counted"] & (runs["bias"] == "")]
+    full = used[~used["cut"]].groupby("group").size()
+    table = used.groupby("group")[columns].mean()
     values = zip(table.index, table.to_numpy(dtype=float).tolist(), strict=True)
     means = {str(group): dict(zip(columns, row, strict=True)) for group, row in values}
     nothing = dict.fromkeys(columns, float("nan"))
@@ -107,6 +115,7 @@ def transfer_table(runs: pd.DataFrame, groups: list[str], reference: str = REFER
             {
                 "group": group,
                 "baseline": name or "",
+                "full_runs": int(full.get(group, 0)),
                 **own,
                 "jumpstart": jumpstart(own["initial_return"], base["initial_return"]),
                 "asymptotic_gain": own["asymptotic_return"] - base["asymptotic_return"],
@@ -128,7 +137,10 @@ def _baseline(group: str, reference: str) -> str | None:
 
 
 def scores(runs: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Asymptotic returns in rliable's shape: for each group an array (runs x tasks), here one task, seeds ascending."""
+    """Asymptotic returns in rliable's shape: for each group an array (runs x tasks), here one task, seeds ascending.
+
+    Runs that stopped at their threshold have none.
+    """
     counted = runs[runs["counted"] & runs["asymptotic_return"].notna()]
     return {
         str(group): own.sort_values("seed")[["asymptotic_return"]].to_numpy(dtype=float)
