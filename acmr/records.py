@@ -40,6 +40,8 @@ COMPLETE, DIVERGED = "complete", "diverged"
 ENDED = (COMPLETE, DIVERGED)
 #: What other programs call a run that came to its end.
 _FINISHED = ("completed", "finished", "done", "success", "successful", "succeeded", "ended", "ok")
+#: What is said of a run that came to its end before any of its episodes did.
+NO_EPISODE = "no episode ended"
 
 #: The first columns of every ``episodes.csv``; a file with only these is complete.
 EPISODE_COLUMNS = ("global_step", "episodic_return", "episode_length")

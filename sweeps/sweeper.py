@@ -17,7 +17,7 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig
 
 from acmr.config import ConfigError
-from acmr.records import COMPLETE, FAILED, RUNNING, STOPPED
+from acmr.records import COMPLETE, FAILED, NO_EPISODE, RUNNING, STOPPED
 from acmr.settings.compose import CONFIG_FOLDER, look_in, sources
 from acmr.settings.sources import sources_of
 from acmr.text import one_line
@@ -209,7 +209,9 @@ class Sweep:
     def _report(self, display: Display) -> int:
         failed = display.tell_failures()
         complete = sum(view.state == COMPLETE for view in display.views)
-        print(f"{complete} of {len(display.views)} runs complete: {_places(self._plan)}")
+        empty = sum(view.reason == NO_EPISODE for view in display.views)
+        remark = f" ({empty} of them: {NO_EPISODE})" if empty else ""
+        print(f"{complete} of {len(display.views)} runs complete{remark}: {_places(self._plan)}")
         if self._signal is not None:
             print(f"stopped by {signal.Signals(self._signal).name}; to go on: {self._command()}", flush=True)
             return 128 + self._signal

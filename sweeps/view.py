@@ -10,7 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from acmr.cells import full_name, stops
-from acmr.records import COMPLETE, DIVERGED, FAILED, RUNNING, STOPPED, SUMMARY_FILE, ended_state, unended_reason
+from acmr.records import (
+    COMPLETE,
+    DIVERGED,
+    FAILED,
+    NO_EPISODE,
+    RUNNING,
+    STOPPED,
+    SUMMARY_FILE,
+    ended_state,
+    unended_reason,
+)
 from acmr.storage.json_files import read_json
 from acmr.storage.processes import is_alive
 from acmr.tracking.status_file import read_status
@@ -69,9 +79,10 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
     ended = None if summary is None else ended_state(summary)
     if summary is not None and ended is not None:
         step, speed = int(summary.get("global_step") or 0), float(summary.get("steps_per_second") or 0)
-        met = summary.get("steps_to_threshold")
+        met, latest = summary.get("steps_to_threshold"), summary.get("final_return")
         total = step if ended == COMPLETE else int(summary.get("total_timesteps") or total)
-        return RunStatus(name, seed, directory, ended, step, total, speed, summary.get("final_return"), met=met)
+        reason = NO_EPISODE if summary.get("episodes") == 0 else ""
+        return RunStatus(name, seed, directory, ended, step, total, speed, latest, reason, met)
     status = read_status(directory) or {}
     alive = status.get("state") == RUNNING and _is_alive(status)
     told, reason = _told(status, state or State(STOPPED), alive)

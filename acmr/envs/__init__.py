@@ -20,7 +20,7 @@ from acmr.config import ConfigError, EnvConfig
 from acmr.envs.construct import cannot_run, construct
 from acmr.envs.conversion import ConvertedEnv, FaultyEnvironmentError
 from acmr.envs.naming import part_names, probe
-from acmr.envs.state import ResumeCheck, try_resume
+from acmr.envs.state import ResumeCheck, time_limits, try_resume
 from acmr.envs.wrappers import PartialEnv, kept_rows
 from acmr.records import REWARD_PREFIX, VELOCITY_KEY
 
@@ -36,11 +36,12 @@ class EnvDescription:
         action_names: One per action.
         action_low: Least value of each action.
         action_high: Greatest value of each action.
-        max_episode_steps: Steps an episode may take; None: it has no time limit.
+        max_episode_steps: Steps an episode may take; None: no time limit is known.
         bodies: Names of the MuJoCo bodies without the world; empty where there is no MuJoCo model.
         reward_terms: Keys of ``info`` that begin with ``reward_``: the parts that the reward is made of.
         has_forward_velocity: Whether ``info`` holds ``x_velocity``, in m/s.
         model_hash: SHA-256 (hex) of the compiled MuJoCo model, or of the registration where there is no model.
+        parts: What the observation is made of, as in ``Dict``, where it is not one array; else None.
     """
 
     observation_names: tuple[str, ...]
@@ -52,6 +53,25 @@ class EnvDescription:
     reward_terms: tuple[str, ...]
     has_forward_velocity: bool
     model_hash: str
+    parts: str | None = None
+
+    def remarks(self, name: str) -> list[str]:
+        """What somebody who trains in it should know at once, in lines.
+
+        Args:
+            name: What to call the environment.
+        """
+        lines = []
+        if self.parts is not None:
+            names = self.observation_names
+            shown = ", ".join(names if len(names) <= 6 else [*names[:3], "...", *names[-2:]])
+            lines.append(f"observations of {name}: a {self.parts}, laid side by side as {len(names)} numbers: {shown}")
+        if self.max_episode_steps is None:
+            lines.append(
+                f"warning: {name} has no time limit: an episode lasts until it ends by itself, and only episodes that "
+                "end are recorded; type env.max_episode_steps=1000 to set one"
+            )
+        return lines
 
 
 #: What was seen of environments with all their sensors and actuators, by the settings that they were made from.
@@ -145,17 +165,17 @@ def _key(config: EnvConfig) -> str:
 def _look_at(env: ConvertedEnv) -> EnvDescription:
     seen, actions, model = probe(env), env.action_space, getattr(env.unwrapped, "model", None)
     assert isinstance(actions, Box)
-    assert env.spec is not None
     return EnvDescription(
         observation_names=seen.observation_names,
         action_names=seen.action_names,
         action_low=tuple(actions.low.ravel().tolist()),
         action_high=tuple(actions.high.ravel().tolist()),
-        max_episode_steps=env.spec.max_episode_steps,
+        max_episode_steps=min(time_limits(env), default=None),
         bodies=part_names(model).bodies[1:] if isinstance(model, mujoco.MjModel) else (),
         reward_terms=tuple(key for key in seen.info_keys if key.startswith(REWARD_PREFIX)),
         has_forward_velocity=VELOCITY_KEY in seen.info_keys,
         model_hash=_hash(env),
+        parts=None if env.observation_names is None else type(env.env.observation_space).__name__,
     )
 
 

@@ -41,6 +41,7 @@ def details(name: str) -> Iterator[str]:
     limit = f"{about.max_episode_steps} steps an episode" if about.max_episode_steps else "no time limit"
     yield f"# {config.name}: {_what(config)}" if _what(config) != config.name else f"# {config.name}"
     yield f"# {len(about.observation_names)} observations, {len(about.action_names)} actions, {limit}"
+    yield from (f"# {line}" for line in about.remarks(config.name))
     if about.bodies:
         yield f"# bodies: {' '.join(about.bodies)}"
     for index, label in enumerate(about.observation_names):

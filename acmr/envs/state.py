@@ -94,6 +94,11 @@ def restore(env: Env, state: State) -> None:
             _restore_robot(bare, state["robot"])
 
 
+def time_limits(env: Env) -> list[int]:
+    """Steps after which the time limits around an environment end an episode, its own wrappers' included."""
+    return [limit._max_episode_steps for _, limit in _time_limits(_layers(env))]
+
+
 def _layers(env: Env) -> dict[str, Env]:
     """The wrappers from the outermost, then the environment itself, each under a name of its own."""
     found = [env]

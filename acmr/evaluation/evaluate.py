@@ -14,7 +14,7 @@ import numpy as np
 
 from acmr.config import ConfigError, EnvConfig
 from acmr.evaluation.camera import is_robot, make_camera
-from acmr.evaluation.rollout import Episode, VideoOptions, play, render_mode
+from acmr.evaluation.rollout import MOST_STEPS, Episode, VideoOptions, play, render_mode
 from acmr.records import CONFIG_FILE, EVALUATION_FILE
 from acmr.settings.compose import environment_config
 from acmr.storage.durable import WriteError
@@ -69,6 +69,13 @@ def check_fit(teacher: Teacher, config: EnvConfig) -> str | None:
     return None
 
 
+def limit(config: EnvConfig) -> int | None:
+    """Steps that an episode may take; None: no time limit is known."""
+    from acmr.envs import describe
+
+    return describe(config).max_episode_steps
+
+
 def report(episodes: Sequence[Episode], **about: Any) -> dict[str, Any]:
     """What ``evaluation.json`` says; the standard deviation is that of these episodes (divided by their number)."""
     returns = [episode.episodic_return for episode in episodes]
@@ -93,6 +100,10 @@ def evaluate(given: argparse.Namespace) -> None:
     remark = check_fit(teacher, config)
     if remark:
         print(f"warning: {remark}", file=sys.stderr)
+    if limit(config) is None:
+        print(
+            f"warning: {config.name} has no time limit: an episode is cut off at {MOST_STEPS:,} steps", file=sys.stderr
+        )
     actor = teacher.build_networks().actor.eval()
     episodes = []
     video = VideoOptions(given.video, given.seconds, given.width, given.height) if given.video else None

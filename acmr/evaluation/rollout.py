@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,9 @@ from acmr.agent.networks import Actor
 from acmr.config import EnvConfig
 from acmr.evaluation.video import Film
 from acmr.records import EpisodeInProgress
+
+#: Steps after which an episode is cut off where the environment has no time limit.
+MOST_STEPS = 10_000
 
 
 @dataclass(frozen=True)
@@ -84,16 +88,14 @@ def play(
                 action = _act(actor, observation, noise if stochastic else None)
                 observation, reward, terminated, truncated, info = env.step(action)
                 episode.step(float(reward), info)
+                truncated = truncated or (about.max_episode_steps is None and episode.length >= MOST_STEPS)
             if film is not None:
                 film.end_episode()
             record = episode.record(episode.length)
-            yield Episode(
-                seed + number,
-                record.episodic_return,
-                record.episode_length,
-                record.mean_forward_velocity,
-                bool(terminated),
-            )
+            # An environment that reports its velocity may not have done so in this episode.
+            velocity = record.mean_forward_velocity
+            velocity = None if velocity is None or math.isnan(velocity) else velocity
+            yield Episode(seed + number, record.episodic_return, record.episode_length, velocity, terminated)
     finally:
         if film is not None:
             film.close()

@@ -92,7 +92,8 @@ class Session:
 
     def run(self) -> dict[str, Any]:
         """Trains to the end, and stores what came of it."""
-        for line in [f"run: {self.run_dir}", *self.prepared.report.lines()]:
+        remarks = self.prepared.about.remarks(self.prepared.spec.config.env.name)
+        for line in [f"run: {self.run_dir}", *remarks, *self.prepared.report.lines()]:
             self.say(line)
         state = make_state(self.prepared, self.run_dir)
         checkpoints = make_checkpoints(self.prepared, state, self.run_dir)

@@ -11,7 +11,7 @@ import numpy as np
 from acmr.agent.learner import Learner
 from acmr.config import THRESHOLD
 from acmr.envs import EnvDescription
-from acmr.records import COMPLETE, DIVERGED, EpisodeRecord, steps_to_threshold
+from acmr.records import COMPLETE, DIVERGED, NO_EPISODE, EpisodeRecord, steps_to_threshold
 from acmr.run.reproducibility import git_commit, machine, versions
 from acmr.run.trainer import DivergedError
 from acmr.settings.run_spec import RunSpec
@@ -51,6 +51,7 @@ def summarize(
         "stop": config.stop,
         "stop_after": config.stop_after,
         "episodes": len(history),
+        **({} if history else {"note": f"{NO_EPISODE}, so that nothing is known of the return"}),
         "threshold": config.threshold,
         "consecutive": config.consecutive,
         "steps_to_threshold": met.last if met else None,
@@ -101,6 +102,8 @@ def describe_teacher(
 def reached(summary: Mapping[str, Any]) -> str:
     """Whether a run met its threshold, in words that follow on others."""
     step, total = summary.get("steps_to_threshold"), summary.get("total_timesteps")
+    if summary.get("episodes") == 0:
+        return f", but {NO_EPISODE}: nothing is known of its return; type more total_timesteps or a time limit"
     threshold = f"{summary.get('threshold', float('nan')):g}"
     said = f", return {threshold} reached at step {step:,}" if step else f", return {threshold} not reached"
     if summary.get("stop") != THRESHOLD or summary["global_step"] == total:
