@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import re
 import zlib
 from pathlib import Path
 from typing import Any
@@ -13,37 +14,47 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from acmr.records import EPISODE_COLUMNS, VELOCITY_COLUMN, DamagedError
+from analysis.loading.csv_table import Table, check_signs, read_table, to_numbers
+
+_KNOWN = (*EPISODE_COLUMNS, VELOCITY_COLUMN)
+_COUNTS = ("global_step", "episode_length")
+#: A header as our runs write it.
+_PLAIN_HEADER = re.compile(rb"\w+(,\w+)*\r?")
+
+_Numbers = dict[str, NDArray[Any]]
 
 
-def read_episodes(path: Path) -> tuple[pd.DataFrame, list[str]]:
+def read_episodes(path: Path, own: bool = False, ended: bool = False) -> tuple[pd.DataFrame, list[str]]:
     """Reads the episodes of one run.
 
-    The last line is left out if it does not end (the run was cut off in the middle of writing it). Returns that are
-    no finite number become NaN, which meets no threshold.
+    Returns that are no finite number become NaN, which meets no threshold. Of a last line that does not end nobody
+    knows whether its last number is whole: a run of ours that has not ended was cut off in the middle of writing it,
+    and it is left out. Other programs, and editors, end files so: there it counts if all its values are there.
 
     Args:
-        path: ``episodes.csv`` or ``episodes.csv.gz``; columns beyond the known ones are passed over.
+        path: ``episodes.csv`` or ``episodes.csv.gz`` (:func:`~analysis.loading.csv_table.read_table` says what may
+            stand in it); columns beyond the known ones are passed over.
+        own: Whether it is a run of this project's. It takes one step at a time, so that no two of its episodes end at
+            the same one; those of environments that step together may.
+        ended: Whether the run came to its end.
 
     Returns:
-        The frame: ``global_step`` (int64, strictly ascending), ``episodic_return``, ``episode_length`` (steps, int64),
+        The frame: ``global_step`` (int64, ascending), ``episodic_return``, ``episode_length`` (steps, int64),
         ``mean_forward_velocity`` (m/s, NaN where it was not recorded); and what there is to say about the file.
 
     Raises:
         DamagedError: If the columns are not there, a line cannot be read, or the rows are not in order.
     """
-    header, _, body = _contents(path).partition(b"\n")
-    columns = header.decode("utf-8-sig", errors="replace").strip().split(",")
-    missing = [name for name in EPISODE_COLUMNS if name not in columns]
-    if missing:
-        raise DamagedError(f"{path.name}: no column {', '.join(missing)} (needed: {','.join(EPISODE_COLUMNS)})")
-    notes = []
-    body, cut = _whole_lines(body)
-    if cut:
-        line = body.count(b"\n") + 2
-        notes.append(f"cut off in line {line}, which is left out")
-    frame, said = _parse(path.name, columns, body)
+    content, notes = _contents(path), list[str]()
+    if own and not ended:
+        content, notes = _whole_lines(content)
+    numbers, lines, said = _read_plain(content) or _read_any(path.name, content)
     notes += said
-    _check_order(path.name, frame)
+    for column in _COUNTS:
+        numbers[column] = _to_counts(path.name, column, numbers[column], lines)
+    numbers.setdefault(VELOCITY_COLUMN, np.full(len(lines), np.nan))
+    frame = pd.DataFrame({column: numbers[column] for column in _KNOWN})
+    _check_order(path.name, frame, lines, own)
     returns = frame["episodic_return"].to_numpy()
     odd = ~np.isfinite(returns)
     if odd.any():
@@ -64,72 +75,76 @@ def _contents(path: Path) -> bytes:
         raise DamagedError(f"{path.name}: {error.strerror or error}") from None
 
 
-def _whole_lines(body: bytes) -> tuple[bytes, bool]:
-    end = body.rfind(b"\n") + 1
-    whole = body[:end].rstrip(b"\r\n")
-    return (whole + b"\n" if whole else b""), bool(body[end:].strip())
+def _whole_lines(content: bytes) -> tuple[bytes, list[str]]:
+    """The lines that end, and a note if the last one does not; a header alone need not."""
+    end = content.rfind(b"\n") + 1
+    if not end or not content[end:].strip():
+        return content, []
+    return content[:end], [_cut_off(content.count(b"\n") + 1)]
 
 
-def _parse(name: str, columns: list[str], body: bytes) -> tuple[pd.DataFrame, list[str]]:
-    # A line that is too short would go unnoticed if only columns after the first ones are missing.
-    if body.count(b",") != body.count(b"\n") * (len(columns) - 1):
-        raise _first_fault(name, columns, body)
-    notes: list[str] = []
-    numbers = _numbers(body, columns, (*EPISODE_COLUMNS, VELOCITY_COLUMN))
-    if numbers is None:
-        numbers = _numbers(body, columns, EPISODE_COLUMNS)
-        if VELOCITY_COLUMN in columns:
-            notes.append(f"{VELOCITY_COLUMN} is left out, for it holds more than numbers")
-    if numbers is None:
-        raise _first_fault(name, columns, body)
-    for column in ("global_step", "episode_length"):
-        values = numbers[column]
-        whole = np.isfinite(values) & (values == np.floor(values)) & (values > 0) & (values < 2.0**53)
-        if not whole.all():
-            row = int(np.argmin(whole))
-            raise DamagedError(f"{name}: line {row + 2}: {column} is {values[row]:g}, not a count of steps")
-        numbers[column] = values.astype(np.int64)
-    numbers.setdefault(VELOCITY_COLUMN, np.full(len(numbers["global_step"]), np.nan))
-    return pd.DataFrame(numbers), notes
+def _cut_off(line: int) -> str:
+    return f"cut off in line {line}, which is left out"
 
 
-def _numbers(body: bytes, columns: list[str], wanted: tuple[str, ...]) -> dict[str, NDArray[Any]] | None:
-    """Columns of a table without header, each number read to its last bit; None if one holds anything else."""
-    there = [column for column in wanted if column in columns]
-    if not body:
-        return {column: np.empty(0) for column in there}
+def _read_plain(content: bytes) -> tuple[_Numbers, NDArray[np.int64], list[str]] | None:
+    """Columns and lines of a file as our runs write it, read to the last bit and quickly; None: it is none."""
+    header, _, body = content.partition(b"\n")
+    if not _PLAIN_HEADER.fullmatch(header) or (body and not body.endswith(b"\n")):
+        return None
+    columns = header.decode().strip().split(",")
+    there = [column for column in _KNOWN if column in columns]
+    first = body.partition(b"\n")[0].decode(errors="replace").split(",")
+    # A count with a point may be thousands.
+    pointed = any("." in value for column, value in zip(columns, first, strict=False) if column in _COUNTS)
+    whole = body.count(b",") == body.count(b"\n") * (len(columns) - 1)
+    if pointed or not whole or len({*columns}) < len(columns) or not set(EPISODE_COLUMNS) <= set(there):
+        return None
     positions = [columns.index(column) for column in there]
     try:
-        table = np.loadtxt(io.BytesIO(body), delimiter=",", usecols=positions, comments=None, ndmin=2)
+        table = np.loadtxt(io.BytesIO(body), delimiter=",", usecols=positions, comments=None, ndmin=2) if body else None
     except ValueError:
         return None
-    return dict(zip(there, np.ascontiguousarray(table.T), strict=True))
+    values = np.empty((len(there), 0)) if table is None else np.ascontiguousarray(table.T)
+    return dict(zip(there, values, strict=True)), np.arange(2, values.shape[1] + 2), []
 
 
-def _first_fault(name: str, columns: list[str], body: bytes) -> DamagedError:
-    for number, line in enumerate(body.decode("utf-8", errors="replace").splitlines(), start=2):
-        values = line.split(",")
-        if len(values) != len(columns):
-            return DamagedError(f"{name}: line {number} holds {len(values)} values, not {len(columns)}")
-        for column, value in zip(columns, values, strict=True):
-            if column in EPISODE_COLUMNS and not _is_number(value):
-                return DamagedError(f"{name}: line {number}: {column} is {value[:20]!r}, not a number")
-    return DamagedError(f"{name}: cannot be read as a table of numbers")
+def _read_any(name: str, content: bytes) -> tuple[_Numbers, NDArray[np.int64], list[str]]:
+    """Columns, lines and notes of a file as others write it."""
+    table, notes = read_table(name, content, EPISODE_COLUMNS, _KNOWN), list[str]()
+    if (line := table.cut) is not None:
+        before, last = table.split(line)
+        if not last.rows or any(_is_read(before, column) and not _is_read(last, column) for column in _KNOWN):
+            table, notes = before, [_cut_off(line)]
+    numbers = {column: to_numbers(table, column) for column in EPISODE_COLUMNS}
+    if _is_read(table, VELOCITY_COLUMN):
+        numbers[VELOCITY_COLUMN] = to_numbers(table, VELOCITY_COLUMN)
+    elif VELOCITY_COLUMN in table.columns:
+        notes.append(f"{VELOCITY_COLUMN} is left out, for it holds more than numbers")
+    check_signs(table, list(numbers), _COUNTS)
+    return numbers, np.array(table.lines, dtype=np.int64), notes
 
 
-def _is_number(text: str) -> bool:
+def _is_read(table: Table, column: str) -> bool:
+    """Whether a column is there and holds numbers only."""
     try:
-        float(text)
-    except ValueError:
+        return column in table.columns and to_numbers(table, column) is not None
+    except DamagedError:
         return False
-    return True
 
 
-def _check_order(name: str, frame: pd.DataFrame) -> None:
+def _to_counts(name: str, column: str, values: NDArray[Any], lines: NDArray[np.int64]) -> NDArray[np.int64]:
+    whole = np.isfinite(values) & (values == np.floor(values)) & (values > 0) & (values < 2.0**53)
+    if not whole.all():
+        row = int(np.argmin(whole))
+        raise DamagedError(f"{name}: line {lines[row]}: {column} is {values[row]:g}, not a count of steps")
+    return values.astype(np.int64)
+
+
+def _check_order(name: str, frame: pd.DataFrame, lines: NDArray[np.int64], own: bool) -> None:
     steps = frame["global_step"].to_numpy()
-    ahead = np.diff(steps) > 0
+    ahead = np.diff(steps) > 0 if own else np.diff(steps) >= 0
     if not ahead.all():
-        row = int(np.argmin(ahead))
-        raise DamagedError(
-            f"{name}: rows are not in order: line {row + 3} is at step {steps[row + 1]}, the one before at {steps[row]}"
-        )
+        row = int(np.argmin(ahead)) + 1
+        said = f"line {lines[row]} is at step {steps[row]}, the one before at {steps[row - 1]}"
+        raise DamagedError(f"{name}: rows are not in order: {said}")

@@ -73,7 +73,7 @@ def read_run(root: Path, folder: RunFolder) -> FoundRun:
         summary = _mapping_of(directory / SUMMARY_FILE)
         path = next((directory / name for name in EPISODE_FILES if (directory / name).is_file()), None)
         if path is not None:
-            frame, said = read_episodes(path)
+            frame, said = read_episodes(path, own=bool(config), ended=bool(summary))
             notes += said
         elif not problem:
             notes.append(f"no {EPISODES_FILE}")
