@@ -173,7 +173,7 @@ class PairConfig:
 class ExperimentConfig:
     """Everything that defines one run."""
 
-    #: Of every random number of the run. A teacher that no path names is the one with the same seed.
+    #: Of every random number of the run, 0 to 2**53 - 1. A teacher that no path names is the one with the same seed.
     seed: int = 1
     #: Whether what is copied from the teacher stays as it is.
     freeze: bool = False

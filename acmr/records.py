@@ -31,6 +31,8 @@ EVALUATION_FILE = "evaluation.json"
 #: Folder of TensorBoard's event files: they show a run, and are no result.
 EVENTS_FOLDER = "tensorboard"
 #: A run's place below the folder of all runs is ``<profile>/<name>/seed_<n>``.
+#: The greatest seed: the greatest integer that every reader of CSV and JSON holds exactly.
+MOST_SEED = 2**53 - 1
 SEED_FOLDER = re.compile(r"seed_(\d+)")
 
 #: States of a run that is under way, was asked to stop or was ended by an error, as ``status.json`` names them.

@@ -19,7 +19,10 @@ from acmr.config import ConfigError
 from acmr.evaluation.camera import without_gl
 from acmr.evaluation.evaluate import evaluate, still
 from acmr.evaluation.video import FILM_SUFFIXES
-from acmr.records import EVALUATION_FILE
+from acmr.records import EVALUATION_FILE, MOST_SEED
+
+#: Of one side of a picture, and of a film.
+_MOST_PIXELS, _MOST_SECONDS = 8192, 1e6
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -65,6 +68,8 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     given = parser.parse_args(arguments)
     if given.seed < 0:
         parser.error(f"--seed {given.seed}: an integer of at least 0 is needed")
+    if given.seed + given.episodes - 1 > MOST_SEED:
+        parser.error(f"--seed {given.seed} --episodes {given.episodes}: seeds of at most {MOST_SEED} are needed")
     if given.seconds is not None and given.video is None:
         parser.error(f"--seconds {given.seconds:g}: there is no film; type --video FILE.mp4 as well")
     return given
@@ -72,7 +77,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
 
 def _add_size(parser: argparse.ArgumentParser) -> None:
     for name in ("--width", "--height"):
-        parser.add_argument(name, type=_positive, default=480, metavar="PIXELS", help="of the picture; default: 480")
+        parser.add_argument(name, type=_pixels, default=480, metavar="PIXELS", help="of the picture; default: 480")
 
 
 def _positive(text: str) -> int:
@@ -81,13 +86,22 @@ def _positive(text: str) -> int:
     return int(text)
 
 
+def _pixels(text: str) -> int:
+    value = _positive(text)
+    if value > _MOST_PIXELS:
+        raise argparse.ArgumentTypeError(f"{text}: at most {_MOST_PIXELS} pixels can be drawn")
+    return value
+
+
 def _seconds(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text}: a number of seconds above 0 is needed")
+    if not 0 < value <= _MOST_SECONDS:
+        raise argparse.ArgumentTypeError(
+            f"{text}: a number of seconds above 0 is needed, and at most {_MOST_SECONDS:g}"
+        )
     return value
 
 

@@ -9,12 +9,12 @@ import torch
 
 from acmr.agent.architecture import Architecture, Dimensions
 from acmr.agent.learner import Learner, find_learner
+from acmr.agent.memory import check_memory
 from acmr.agent.networks import Networks
 from acmr.agent.precision import MatmulPrecision, choose_products
 from acmr.config import ConfigError, ExperimentConfig
 from acmr.envs import EnvDescription, check_resume, describe
 from acmr.envs.state import ResumeCheck
-from acmr.records import TENSOR_FILE
 from acmr.run.random_streams import RandomStreams, random_streams
 from acmr.settings.run_spec import RunSpec, teacher_spec
 from acmr.storage.run_dir import RunDir
@@ -68,6 +68,7 @@ def prepare(spec: RunSpec) -> Prepared:
     teacher = find_teacher(config, dims)
     streams = random_streams(config.seed, config.device)
     architecture = Architecture(dims, tuple(config.agent.hidden_sizes), about.action_low, about.action_high)
+    check_memory(config, architecture)
     fresh = Networks(architecture, streams.networks)
     networks, report = transfer(fresh, teacher, config.transfer, config.freeze, streams.networks)
     copied_alpha = teacher is not None and config.transfer.copy_log_alpha
@@ -101,14 +102,13 @@ def find_teacher(config: ExperimentConfig, dims: Dimensions) -> Teacher | None:
         about = describe(source.config.env)
         theirs = Dimensions(len(about.observation_names), len(about.action_names))
         check_body(config.transfer, f"the source environment {source.config.env.name}", theirs, dims)
-    path = source.directory / TENSOR_FILE
     if not RunDir(source.directory).is_complete():
         state = "is not finished" if RunDir(source.directory).stored_settings() else "does not exist"
         raise ConfigError(
             f"transfer={config.transfer.name}: the teacher's run {source.directory} {state}; "
             f"train it with: {source.command} (or give another one: transfer.teacher=PATH)"
         )
-    return load_teacher(path)
+    return load_teacher(source.directory)
 
 
 def _check_device(device: str) -> None:

@@ -195,12 +195,14 @@ def make_trainer(prepared: Prepared, env: gym.Env[np.ndarray, np.ndarray], logs:
     """
     config, streams, about = prepared.spec.config, prepared.streams, prepared.about
     dims = prepared.networks.dims
+    # What the run cannot fill it need not ask for; which transitions are drawn is the same.
+    capacity = min(config.agent.buffer_size, config.most_steps)
     return Trainer(
         env=env,
         agent=prepared.learner(
             prepared.networks, config.agent, streams.acting, streams.learning, prepared.log_alpha, config.device
         ),
-        buffer=ReplayBuffer(config.agent.buffer_size, dims.observation, dims.action, config.device),
+        buffer=ReplayBuffer(capacity, dims.observation, dims.action, config.device),
         streams=streams,
         total_timesteps=config.most_steps,
         log_every=config.log_every,

@@ -15,6 +15,10 @@ from acmr.config import (
     ConfigError,
     ExperimentConfig,
 )
+from acmr.records import MOST_SEED
+
+#: No machine has more.
+MOST_THREADS = 4096
 
 
 def validate(config: ExperimentConfig) -> None:
@@ -28,8 +32,9 @@ def validate(config: ExperimentConfig) -> None:
     """
     agent = config.agent
     _at_least("seed", config.seed, 0)
-    for key in ("total_timesteps", "consecutive", "threads", "log_every"):
+    for key in ("total_timesteps", "consecutive", "log_every"):
         _at_least(key, getattr(config, key), 1)
+    _at_least("threads", config.threads, 1, MOST_THREADS)
     for key in ("batch_size", "buffer_size", "policy_frequency", "target_network_frequency"):
         _at_least(f"agent.{key}", getattr(agent, key), 1)
     _at_least("agent.learning_starts", agent.learning_starts, 0)
@@ -48,6 +53,8 @@ def validate(config: ExperimentConfig) -> None:
             f"agent.hidden_sizes={agent.hidden_sizes}: one or more widths of at least 1 are needed, "
             "as in agent.hidden_sizes=[256,256]"
         )
+    if max(agent.hidden_sizes) > MOST_SEED:
+        raise ConfigError(f"agent.hidden_sizes={agent.hidden_sizes}: integers of at most {MOST_SEED} are needed")
     _one_of("agent.precision", agent.precision, PRECISIONS)
     _one_of("progress", config.progress, PROGRESS_MODES)
     _one_of("resume", config.resume, (EXACT, INEXACT))
@@ -106,9 +113,11 @@ def _check_transfer(config: ExperimentConfig) -> None:
         )
 
 
-def _at_least(key: str, value: int, least: int) -> None:
+def _at_least(key: str, value: int, least: int, most: int = MOST_SEED) -> None:
     if value < least:
         raise ConfigError(f"{key}={value}: an integer of at least {least} is needed, as in {key}={max(least, 1)}")
+    if value > most:
+        raise ConfigError(f"{key}={value}: an integer of at most {most} is needed")
 
 
 def _within(key: str, value: float, *, low: float, high: float, low_open: bool = False) -> None:
