@@ -47,10 +47,11 @@ class StagedSweeper(BasicSweeper):
         """
         # Here, because Hydra imports this file at the start of every single run.
         from acmr.config import ConfigError
-        from sweeps.sweeper import Settings, run_sweep
+        from sweeps.sweeper import Settings, check_swept, run_sweep
 
         assert self.hydra_context is not None
         assert self.config is not None
+        check_swept(self.params, self.config)
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
         overrides = parser.parse_overrides([*self._parse_config(), *arguments])
         for override in overrides:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,13 +13,15 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 
 from acmr.config import ConfigError
-from acmr.settings.compose import PATH_KEYS, as_override
-from acmr.settings.sources import SWEEPS
+from acmr.settings.compose import CONFIG_FOLDER, PATH_KEYS, as_override, groups, look_in, options
+from acmr.settings.sources import SWEEPS, Sources
 
 #: Words of a sweep, and where Hydra keeps them: they are no settings of a run.
 SWEEP_WORDS = {word: f"hydra.sweeper.{word}" for word in ("plan", "retries", "workers")}
 #: Further folders of settings files.
 SEARCH_PATH = "hydra.searchpath"
+#: What Hydra reads as another thing than a name.
+_NO_NAME = re.compile(r"null|true|false|[-+]?[0-9.]+", re.IGNORECASE)
 
 
 def hydra_arguments(given: Sequence[str]) -> list[str]:
@@ -27,7 +30,12 @@ def hydra_arguments(given: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: If there are options that Hydra does not have, or a folder is not there.
     """
-    _check_options(given)
+    chosen = _check_options(given)
+    searched = [place for argument in given if _is_search_path(argument) for place in _searched(argument)]
+    folder = [f"file://{Path(chosen.config_dir).absolute()}"] if chosen.config_dir else []
+    main = CONFIG_FOLDER.parent / chosen.config_path if chosen.config_path else CONFIG_FOLDER
+    # Until Hydra says what it has found: so that what is wrong with a file can be said with its place.
+    look_in(Sources((f"file://{main}", *folder, *dict.fromkeys([*searched, SWEEPS])), chosen.config_name or "config"))
     arguments = [_in_hydras_words(argument) for argument in given]
     several = any(argument.partition("=")[0] in SWEEP_WORDS for argument in given)
     return ["--multirun", *arguments] if several else arguments
@@ -39,8 +47,11 @@ def _in_hydras_words(argument: str) -> str:
         return f"{SWEEP_WORDS[key]}{equal}{value}"
     if key.lstrip("+") in PATH_KEYS:
         return _quoted(key, value)
-    if key.lstrip("+") == SEARCH_PATH:
-        return _search_path(argument)
+    if _is_search_path(argument):
+        # Added to the places that the project needs, where Hydra would put others in their place.
+        return f"{SEARCH_PATH}={as_override([*dict.fromkeys([*_searched(argument), SWEEPS])])}"
+    if _NO_NAME.fullmatch(value) and key in groups():
+        raise ConfigError(f"{key}={value}: must be one of {', '.join(options(key))}, or left out")
     return argument
 
 
@@ -56,11 +67,13 @@ def _quoted(key: str, value: str) -> str:
     return argument
 
 
-def _search_path(argument: str) -> str:
-    """Adds to the places that the project needs, where Hydra would put others in their place."""
+def _is_search_path(argument: str) -> bool:
+    return argument.partition("=")[0].lstrip("+") == SEARCH_PATH
+
+
+def _searched(argument: str) -> list[str]:
     value = OverridesParser.create().parse_overrides([argument])[0].value()
-    places = [_place(str(place)) for place in (value if isinstance(value, list) else [value])]
-    return f"{SEARCH_PATH}={as_override([*dict.fromkeys([*places, SWEEPS])])}"
+    return [_place(str(place)) for place in (value if isinstance(value, list) else [value])]
 
 
 def _place(place: str) -> str:
@@ -76,11 +89,8 @@ def _place(place: str) -> str:
     return f"file://{folder.absolute()}"
 
 
-def _check_options(given: Sequence[str]) -> None:
-    options = [argument for argument in given if argument.startswith("-")]
-    if not options:
-        return
-    if any(option == "-f" or option.startswith("--f=") for option in options):
+def _check_options(given: Sequence[str]) -> argparse.Namespace:
+    if any(argument == "-f" or argument.startswith("--f=") for argument in given):
         # What Jupyter tells its kernel; a cell that calls run.main() finds it in sys.argv.
         raise ConfigError(
             f"{' '.join(given)}: these are the words of a notebook's kernel; type %run run.py seed=1 in a cell, "
@@ -99,3 +109,4 @@ def _check_options(given: Sequence[str]) -> None:
         raise ConfigError(f"{unknown[0]}: stands behind an option; options such as -m go before all settings")
     if unknown:
         raise ConfigError(f"{unknown[0]}: no such option; python run.py --hydra-help lists them")
+    return known

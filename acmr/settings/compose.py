@@ -22,7 +22,8 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
-from acmr.config import ConfigError, EnvConfig, ExperimentConfig, flatten, schema_defaults
+from acmr.config import ConfigError, EnvConfig, ExperimentConfig, TransferRules, flatten, schema_defaults
+from acmr.settings.files import read_files_with_care
 from acmr.settings.sources import SWEEPS, Sources
 from acmr.settings.validate import validate
 
@@ -44,7 +45,8 @@ def sources() -> Sources:
 
 
 def register_schema() -> None:
-    """Tells Hydra the types of all settings."""
+    """Tells Hydra the types of all settings, and how to read their files."""
+    read_files_with_care()
     ConfigStore.instance().store(name="schema", node=ExperimentConfig)
 
 
@@ -164,12 +166,15 @@ def setting_keys() -> list[str]:
 
 def unknown_key(key: str) -> str:
     """One line on a key that does not exist, with what was probably meant."""
-    keys = setting_keys()
+    keys = [*setting_keys(), *(f"transfer.rules.{rule.name}" for rule in fields(TransferRules))]
     leaf = key.split(".")[-1]
     near = [known for known in keys if known.split(".")[-1] == leaf]
     near = near or get_close_matches(key, [*keys, *groups()], n=3, cutoff=0.6)
     near = near or [known for known in keys if get_close_matches(leaf, [known.split(".")[-1]], cutoff=0.75)][:3]
-    hint = f"did you mean {' or '.join(near)}?" if near else "python run.py --help lists all of them"
+    section = key.rpartition(".")[0]
+    beside = [known for known in keys if section and known.rpartition(".")[0] == section]
+    others = f"there are {', '.join(beside)}" if beside else "python run.py --help lists all of them"
+    hint = f"did you mean {' or '.join(near)}?" if near else others
     return f"{key}: no such setting; {hint}"
 
 

@@ -16,7 +16,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from acmr.config import ConfigError, ExperimentConfig, flatten
-from acmr.settings.compose import groups, launchers, options, setting_keys, unknown_key
+from acmr.settings.compose import groups, launchers, options, setting_keys, sources, unknown_key
+from acmr.settings.files import place_of_key, place_of_text
 from acmr.text import message
 
 #: Settings whose entries are free; Hydra adds to them with a plus sign only.
@@ -39,8 +40,10 @@ def explain(error: BaseException) -> str:
         return f"not readable as YAML: {message(error)}"
     text = str(error)
     if isinstance(error, ConfigCompositionException):
-        if match := re.match(r"In '([^']+)': \w+ raised while composing config:\n(.*)\n *full_key: (.*)", text):
-            return _wrong_file(*match.groups())
+        if match := re.match(r"In '([^']+)': \w+ raised while composing config:\n(.*?)(?:\n *full_key: (.*)|$)", text):
+            return _wrong_file(match[1], match[2], match[3] or "")
+        if match := re.match(r"In '([^']+)': Could not override '([^'@]+)", text):
+            return _wrong_choice(match[1], match[2])
         if match := re.match(r"(?:Ambiguous value for argument|Sweep parameters) '([^']+)'", text):
             return f"{match[1]}: several values are several runs; add -m, as in python run.py -m {quote(match[1])}"
         if match := re.match(r"(?:Could not override|Key) '([^']+)'", text):
@@ -54,6 +57,11 @@ def explain(error: BaseException) -> str:
             return f"+{match[1]}: this setting is there already; type {match[1]}=VALUE"
         if match := re.match(r"Error merging override (.*)", text):
             return _wrong_type(match[1], error)
+    if not text.strip() and error.__cause__ is not None:
+        # Hydra says nothing of what it found in a value.
+        return explain(error.__cause__)
+    if isinstance(error, OmegaConfBaseException) and error.full_key:
+        return _wrong_value(str(error.full_key), text)
     return text.strip().splitlines()[0] if text.strip() else type(error).__name__
 
 
@@ -82,16 +90,46 @@ def _unknown_option(error: MissingConfigException) -> str:
     allowed = launchers() if group == "hydra/launcher" else sorted(error.options or options(group))
     near = get_close_matches(option, allowed, n=1)
     hint = f"; did you mean {group}={near[0]}?" if near else ""
-    file = re.match(r"In '([^']+)': Could not load", str(error))
-    place = f"conf/{file[1]}.yaml: " if file and file[1] != "config" else ""
-    return f"{place}{group}={option}: must be one of {', '.join(allowed)}{hint}"
+    by = re.match(r"In '([^']+)': Could not (?:load|find)", str(error))
+    ours = by is not None and by[1] != sources().name and not by[1].startswith("hydra/")
+    place, file = sources().file(by[1]) if by and ours else ("", None)
+    before, behind = f"{place}: " if place else "", place_of_text(file, option)
+    if not allowed:
+        near = get_close_matches(group, groups(), n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        return f"{before}{group}={option}: there is no group {group}, only {', '.join(groups())}{hint}{behind}"
+    return f"{before}{group}={option}: must be one of {', '.join(allowed)}{hint}{behind}"
 
 
 def _wrong_file(file: str, reason: str, key: str) -> str:
-    """One line on a file of ``conf/`` that does not fit the settings' types."""
-    if re.match(r"Key '.*' not in", reason):
-        return f"conf/{file}.yaml: {unknown_key(key)}"
-    return f"conf/{file}.yaml: {f'{key}: ' if key else ''}{reason}"
+    """One line on a settings file that does not fit the settings' types."""
+    place, path = sources().file(file)
+    if re.match(r"Key '.*' (is )?not in", reason):
+        return f"{place}: {unknown_key(key)}{place_of_key(path, key)}"
+    return f"{place}: {f'{key}: ' if key else ''}{reason}{place_of_key(path, key)}"
+
+
+def _wrong_choice(file: str, group: str) -> str:
+    """One line on a settings file that overrides a choice which is not made before it."""
+    place, path = sources().file(file)
+    behind = place_of_text(path, group)
+    if group not in groups():
+        near = get_close_matches(group, groups(), n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        return f"{place}: override {group}: there is no group {group}, only {', '.join(groups())}{hint}{behind}"
+    return f"{place}: override {group}: only experiments, profiles and matrices choose anew; write - NAME{behind}"
+
+
+def _wrong_value(key: str, reason: str) -> str:
+    """One line on a value that cannot be worked out, and the file that it stands in, if that can be found."""
+    line = reason.strip().splitlines()[0]
+    group = key.partition(".")[0]
+    for option in options(group) if group in groups() else []:
+        place, path = sources().file(f"{group}/{option}")
+        missing = re.search(r"Interpolation key '([^']+)'", line)
+        if missing and (behind := place_of_text(path, f"${{{missing[1]}}}")):
+            return f"{place}: {key}: {line}{behind}"
+    return f"{key}: {line}"
 
 
 def _wrong_type(override: str, error: BaseException) -> str:

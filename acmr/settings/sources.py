@@ -15,19 +15,17 @@ from hydra import version
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
 from hydra.core.object_type import ObjectType
-from hydra.core.plugins import Plugins
 from hydra.core.utils import setup_globals
 from hydra.plugins.config_source import ConfigSource
 from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict
 
 from acmr.config import ConfigError
+from acmr.settings.files import THEIRS, read_files_with_care, shown
 
 #: The project's own matrices, found like a user's groups.
 SWEEPS = "pkg://sweeps"
 _FILE = "file://"
-#: What Hydra calls places that belong to it.
-_THEIRS = ("hydra", "schema")
 _STORED = "sources.json"
 
 
@@ -67,10 +65,12 @@ class Sources:
         """What may be chosen of a group."""
         return sorted({name for source in self._ours() for name in _listed(source, group, ObjectType.CONFIG)})
 
-    def file(self, name: str) -> Path | None:
-        """The file of a choice such as ``env/ant``; None if there is none, or if it is in a package."""
+    def file(self, name: str) -> tuple[str, Path | None]:
+        """The file of a choice such as ``env/ant``: what it is called to the user, and itself if it is in a folder."""
         source = next((source for source in self._ours() if source.is_config(name)), None)
-        return Path(source.path) / f"{name}.yaml" if source is not None and source.scheme() == "file" else None
+        if source is None:
+            return f"{name}.yaml", None
+        return shown(source, name), Path(source.path) / f"{name}.yaml" if source.scheme() == "file" else None
 
     def store(self, folder: Path, main: Path) -> None:
         """Copies the user's settings files, so that whoever edits them changes nothing for :func:`stored_sources`.
@@ -89,7 +89,7 @@ class Sources:
         (folder / _STORED).write_text(json.dumps(asdict(replace(self, paths=tuple(paths)))), encoding="utf-8")
 
     def _ours(self) -> list[ConfigSource]:
-        return [source for source in _loader(self.paths).get_sources() if source.provider not in _THEIRS]
+        return [source for source in _loader(self.paths).get_sources() if source.provider not in THEIRS]
 
 
 def stored_sources(folder: Path, main: Path) -> Sources:
@@ -113,7 +113,7 @@ def sources_of(hydra: DictConfig, usual: Path) -> Sources:
     paths, words, added = [], [], []
     for source in hydra.runtime.config_sources:
         place = os.path.abspath(source.path) if source.schema == "file" else source.path
-        if source.provider in _THEIRS or source.schema not in ("file", "pkg"):
+        if source.provider in THEIRS or source.schema not in ("file", "pkg"):
             continue
         paths.append(f"{source.schema}://{place}")
         if source.provider == "main" and place != str(usual):
@@ -138,8 +138,7 @@ def _loader(paths: tuple[str, ...]) -> ConfigLoaderImpl:
     # tests/test_hydra.py fails where it is gone.
     version.setbase("1.3")
     setup_globals()
-    # Made here because it tells Hydra what file:// and pkg:// mean.
-    Plugins.instance()
+    read_files_with_care()
     search_path = ConfigSearchPathImpl()
     search_path.append("hydra", "pkg://hydra.conf")
     for number, path in enumerate(paths):

@@ -1,0 +1,185 @@
+"""Settings files as people write them: what is wrong with one is one line, with the file and the place in it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra._internal.core_plugins import file_config_source, importlib_resources_config_source
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSource
+from omegaconf import DictConfig, ListConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from acmr.config import ConfigError
+from acmr.text import message
+
+#: What Hydra calls places that belong to it.
+THEIRS = ("hydra", "schema")
+
+
+def read_files_with_care() -> None:
+    """Lets Hydra refuse a settings file that it cannot read as we do, in place of a traceback."""
+    # Hydra makes its own entries first, and tells sources apart by what their addresses begin with.
+    Plugins.instance()
+    SourcesRegistry.instance().types |= {"file": FileConfigSource, "pkg": ImportlibResourcesConfigSource}
+
+
+def shown(source: ConfigSource, name: str) -> str:
+    """A settings file as it is called to the user: ``conf/env/ant.yaml``; those of another folder in full."""
+    folder = source.path.replace(".", "/") if source.scheme() == "pkg" else source.path
+    return f"{Path(folder).name if source.provider == 'main' else folder}/{name.removesuffix('.yaml')}.yaml"
+
+
+class FileConfigSource(file_config_source.FileConfigSource):
+    """A folder of settings files. Its name is that of Hydra's own, which refuses others when it starts plugins again."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Reads one of them.
+
+        Raises:
+            ConfigError: If it is no settings file.
+        """
+        try:
+            result = super().load_config(config_path)
+        except ConfigLoadError:
+            raise
+        except _WRONG as error:
+            raise ConfigError(f"{shown(self, config_path)}: {_wrong(_file(self, config_path), error)}") from error
+        return _checked(self, config_path, result)
+
+
+class ImportlibResourcesConfigSource(importlib_resources_config_source.ImportlibResourcesConfigSource):
+    """A package with settings files; the same holds for its name."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Reads one of them.
+
+        Raises:
+            ConfigError: If it is no settings file.
+        """
+        try:
+            result = super().load_config(config_path)
+        except ConfigLoadError:
+            raise
+        except _WRONG as error:
+            raise ConfigError(f"{shown(self, config_path)}: {_wrong(None, error)}") from error
+        return _checked(self, config_path, result)
+
+
+def _file(source: ConfigSource, name: str) -> Path | None:
+    return Path(source.path) / f"{name.removesuffix('.yaml')}.yaml" if source.scheme() == "file" else None
+
+
+#: What reading a file raises; OmegaConf raises an OSError for a file that holds one number.
+_WRONG = (OSError, ValueError, yaml.YAMLError, RecursionError, OmegaConfBaseException)
+
+
+def _wrong(file: Path | None, error: Exception) -> str:
+    if isinstance(error, UnicodeDecodeError):
+        return f"not written in UTF-8{_first_foreign(file)}; save it as UTF-8"
+    if isinstance(error, RecursionError):
+        return "not readable as YAML: a part of it holds itself, or it is nested too deeply"
+    if isinstance(error, OmegaConfBaseException):
+        key = str(error.full_key or "")
+        return f"{key}: {message(error).partition(' full_key')[0]}{place_of_key(file, key)}"
+    if isinstance(error, yaml.YAMLError):
+        return f"not readable as YAML: {_explained(error)}"
+    if isinstance(error, OSError) and error.strerror:
+        return f"cannot be read ({error.strerror})"
+    return "holds no settings; write key: value"
+
+
+def _explained(error: yaml.YAMLError) -> str:
+    if not isinstance(error, yaml.MarkedYAMLError) or error.problem_mark is None:
+        return message(error)
+    problem = " ".join(filter(None, (error.context, error.problem)))
+    if "'\\t'" in problem:
+        problem = "a tab; indent with spaces"
+    elif match := re.search(r"found duplicate key (.*)", problem):
+        problem = f"{match[1]} is there twice; keep one of them"
+    elif "python/" in problem:
+        problem = "Python objects are not allowed; write plain text"
+    return f"{problem}{position(error.problem_mark)}"
+
+
+def position(mark: Any) -> str:
+    """A place in a file, for the end of a line."""
+    return f" (line {mark.line + 1}, column {mark.column + 1})"
+
+
+def _first_foreign(file: Path | None) -> str:
+    if file is None:
+        return ""
+    raw = file.read_bytes()
+    try:
+        raw.decode()
+    except UnicodeDecodeError as error:
+        lines = raw[: error.start].split(b"\n")
+        return f" (line {len(lines)}, column {len(lines[-1]) + 1})"
+    return ""
+
+
+def _checked(source: ConfigSource, name: str, result: ConfigResult) -> ConfigResult:
+    if source.provider in THEIRS:
+        return result
+    file = _file(source, name)
+    config, place, own = result.config, shown(source, name), name.removesuffix(".yaml").rpartition("/")[2]
+    if isinstance(config, DictConfig) and not config:
+        raise ConfigError(f"{place}: is empty; write its settings, as in name: {own}, or remove the file")
+    defaults = config._get_node("defaults") if isinstance(config, DictConfig) else None
+    if defaults is None:
+        return result
+    if not isinstance(defaults, ListConfig):
+        raise ConfigError(f"{place}: defaults: must be a list, as in defaults: [NAME]{place_of_key(file, 'defaults')}")
+    for entry in defaults._iter_ex(resolve=False):
+        if not isinstance(entry, str) and not (isinstance(entry, DictConfig) and len(entry) == 1):
+            where = place_of_key(file, "defaults")
+            raise ConfigError(f"{place}: defaults: {entry}: must be a name, or GROUP: NAME, one in each entry{where}")
+        if entry in (own, f"/{name}"):
+            raise ConfigError(
+                f"{place}: defaults: {entry}: the file builds on itself; name another one{place_of_text(file, own)}"
+            )
+    return result
+
+
+def place_of_key(file: Path | None, key: str) -> str:
+    """Where a setting stands in a file, for the end of a line; empty if it is not found.
+
+    Args:
+        file: The file, if it is one.
+        key: As ``env.kwargs.a``; the file may lie in a group and leave out the beginning.
+    """
+    root = _nodes(file)
+    parts = key.split(".")
+    for start in range(len(parts)):
+        node, mark = root, None
+        for part in parts[start:]:
+            pairs = node.value if isinstance(node, yaml.MappingNode) else []
+            found = next((pair for pair in pairs if pair[0].value == part), None)
+            if found is None:
+                break
+            mark, node = found[0].start_mark, found[1]
+        else:
+            return position(mark)
+    return ""
+
+
+def place_of_text(file: Path | None, text: str) -> str:
+    """Where a text stands in a file, for the end of a line; empty if it is not found."""
+    if file is None:
+        return ""
+    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        if text in line and not line.lstrip().startswith("#"):
+            return f" (line {number}, column {line.index(text) + 1})"
+    return ""
+
+
+def _nodes(file: Path | None) -> yaml.Node | None:
+    try:
+        return None if file is None else yaml.compose(file.read_text(encoding="utf-8"), yaml.SafeLoader)
+    except (OSError, ValueError, yaml.YAMLError):
+        return None
