@@ -35,7 +35,7 @@ def shown(source: ConfigSource, name: str) -> str:
 
 
 class FileConfigSource(file_config_source.FileConfigSource):
-    """A folder of settings files. Its name is that of Hydra's own, which refuses others when it starts plugins again."""
+    """A folder of settings files, named as Hydra's own: Hydra refuses other names when it starts plugins again."""
 
     def load_config(self, config_path: str) -> ConfigResult:
         """Reads one of them.
