@@ -62,7 +62,7 @@ paper-figures: $(READY) ## every table and figure from the runs of PROFILE (defa
 report: paper-figures ## the same, and where the report lies
 	@echo "open results/$(PROFILE)/report.html"
 
-publish: $(READY) ## add the finished runs of PROFILE to results/, without what is large, to be committed
+publish: $(READY) ## add the finished runs of PROFILE to results/, with networks and evaluations, to be committed
 	@python -m analysis.publish $(RUNS)/$(PROFILE) results/$(PROFILE)
 
 dashboard: $(READY) ## browse all runs in the terminal, offline

@@ -1,7 +1,7 @@
 """Finished runs -> a folder that can be committed: ``python -m analysis.publish runs/paper results/paper``.
 
-What is left out is large or of no use elsewhere: checkpoints, logs, evaluations, the networks of students. The folder
-is analyzed as the runs are, and a teacher in it can be transferred from.
+With each run go its networks and an evaluation of them; what is left out is large or of no use elsewhere: checkpoints,
+logs, films. The folder is analyzed as the runs are, and its networks can be evaluated and transferred from.
 """
 
 from __future__ import annotations
@@ -10,18 +10,23 @@ import argparse
 import gzip
 import json
 import os
+import subprocess
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from acmr.cells import CELLS
 from acmr.command import command
+from acmr.config import THRESHOLD
 from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
     DESCRIPTION_FILE,
     EPISODES_FILE,
+    EVALUATION_FILE,
     METRICS_FILE,
     SUMMARY_FILE,
     TENSOR_FILE,
@@ -31,31 +36,59 @@ from acmr.records import (
 from acmr.run_folders import run_folders
 from acmr.text import size
 
-#: A file above this is compressed.
+#: A table above this is compressed; networks above it are published in half precision, unless students learn from them.
 LARGE = 1_000_000
+#: What the folder of all published runs may hold in all, in bytes: every clone of the project carries it.
+MOST = 60_000_000
+#: Taken for an evaluation before it is made.
+EVALUATION_BYTES = 8_000
 RECORDS = (CONFIG_FILE, SUMMARY_FILE, EPISODES_FILE, METRICS_FILE, TRANSFER_FILE)
-TEACHER = (TENSOR_FILE, DESCRIPTION_FILE)
+NETWORKS = (TENSOR_FILE, DESCRIPTION_FILE)
+#: What every published policy is asked for: deterministic episodes, and the environment seed of the first.
+EPISODES, FIRST_SEED = 20, 0
 
 
 class PublishError(ValueError):
     """Runs that cannot be published. Its message is one line for the user."""
 
 
-def publish(runs: Path, out: Path) -> tuple[list[Path], list[Path]]:
-    """Copies the records of every run that has come to its end, and the networks of those that can teach.
+@dataclass
+class Published:
+    """What came of it.
+
+    Attributes:
+        added: Run directories below the folder to which something was added.
+        there: Those that were whole already.
+        left_out: A line for each evaluation that could not be made.
+    """
+
+    added: list[Path] = field(default_factory=list)
+    there: list[Path] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+
+def _silent(line: str) -> None: ...
+
+
+def publish(runs: Path, out: Path, say: Callable[[str], None] = _silent) -> Published:
+    """Copies the records of every run that has come to its end, and the networks with an evaluation of those complete.
 
     Args:
         runs: Folder of runs, as ``runs/paper``.
         out: Folder that they are added to, under the same names.
-
-    Returns:
-        Run directories below ``out`` that were added, and those that were there already.
+        say: Told of every evaluation before it is made, for it takes a while.
 
     Raises:
-        PublishError: If there is nothing to publish, or ``out`` holds other results of a run; then nothing is written.
+        PublishError: If there is nothing to publish, ``out`` holds other results of a run, or it would become too
+            large; then nothing is written.
     """
     folders = [folder.path for folder in run_folders(runs) if (folder.path / SUMMARY_FILE).is_file()]
-    found = {path.relative_to(runs): files for path in folders if (files := _files(path))}
+    with tempfile.TemporaryDirectory() as scratch:
+        found = {
+            path.relative_to(runs): files
+            for path in folders
+            if (files := _files(path, out / path.relative_to(runs), Path(scratch)))
+        }
     if not found:
         raise PublishError(f"{runs}: no run has come to its end there; make status says how far they are")
     for run, files in found.items():
@@ -64,30 +97,106 @@ def publish(runs: Path, out: Path) -> tuple[list[Path], list[Path]]:
             raise PublishError(
                 f"{out / run}: {', '.join(differing)} of another run there; remove that folder or give another one"
             )
-    there = [run for run, files in found.items() if all((out / run / name).exists() for name in files)]
-    added = [run for run in found if run not in there]
-    for run in added:
+    missing = {run: [name for name in files if not (out / run / name).exists()] for run, files in found.items()}
+    _check_size(out, runs, sum(_bytes_of(found[run], names) for run, names in missing.items()))
+    done = Published()
+    for run, names in missing.items():
         (out / run).mkdir(parents=True, exist_ok=True)
-        for name, data in found[run].items():
-            _write(out / run / name, data)
-    return [out / run for run in added], [out / run for run in there]
+        for name in names:
+            _write(out / run / name, found[run][name])
+        evaluated = _evaluate(runs / run, out / run, say, done.left_out)
+        (done.added if names or evaluated else done.there).append(out / run)
+    return done
 
 
-def _files(run: Path) -> dict[str, bytes]:
-    """Names and contents of what is published of a run; nothing if it has not come to its end."""
+def _files(run: Path, target: Path, scratch: Path) -> dict[str, bytes]:
+    """Names and contents of what is published of a run, but for its evaluation; nothing if it has not ended."""
     try:
         summary = json.loads((run / SUMMARY_FILE).read_text(encoding="utf-8"))
     except ValueError:
         raise PublishError(f"{run / SUMMARY_FILE}: cannot be read; move that run away, or make it anew") from None
     if ended_state(summary) is None:
         return {}
-    names = (*RECORDS, *(TEACHER if _teaches(summary) else ()))
-    return dict(_packed(run / name) for name in names if (run / name).is_file())
+    files = dict(_packed(run / name) for name in RECORDS if (run / name).is_file())
+    # The networks of a run that diverged are of no use.
+    if ended_state(summary) == COMPLETE and all((run / name).is_file() for name in NETWORKS):
+        is_full = _teaches(summary) or (run / TENSOR_FILE).stat().st_size <= LARGE
+        source = run if is_full else _halved(run, target, scratch)
+        files |= {name: (source / name).read_bytes() for name in NETWORKS}
+    return files
 
 
 def _teaches(summary: dict[str, Any]) -> bool:
+    """Whether students learn from this run: the very networks then, so that what they learn can be made again."""
     cell = CELLS.get(str(summary.get("cell")))
-    return cell is not None and cell.teaches and ended_state(summary) == COMPLETE
+    cut = summary.get("stop") == THRESHOLD and summary.get("global_step") != summary.get("total_timesteps")
+    return cell is not None and cell.teaches and not cut
+
+
+def _halved(run: Path, target: Path, scratch: Path) -> Path:
+    """A folder with the networks in half precision: the published one if they are there, else one in ``scratch``."""
+    own, published = _json(run / DESCRIPTION_FILE), _json(target / DESCRIPTION_FILE)
+    if own.get("full_sha256") or (published and published.get("full_sha256") == own.get("sha256")):
+        return run if own.get("full_sha256") else target
+    folder = Path(tempfile.mkdtemp(dir=scratch))
+    problem = _run("acmr.transfer.half", str(run), str(folder))
+    if problem:
+        raise PublishError(problem)
+    return folder
+
+
+def _evaluate(run: Path, target: Path, say: Callable[[str], None], left_out: list[str]) -> bool:
+    """Adds an evaluation of the published networks, if there are networks and it is not there; whether it did."""
+    path, about = target / EVALUATION_FILE, _json(target / DESCRIPTION_FILE)
+    if path.exists() or not about:
+        return False
+    wanted = {"policy": "deterministic", "seed": FIRST_SEED, "episodes": EPISODES, "sha256": about.get("sha256")}
+    own = _json(run / EVALUATION_FILE)
+    if "fall_rate" in own and own | wanted == own:
+        _write(path, (run / EVALUATION_FILE).read_bytes())
+        return True
+    say(f"evaluating {target}, {EPISODES} episodes")
+    # Relative, so that no path of this machine is published.
+    arguments = (os.path.relpath(target), "--episodes", str(EPISODES), "--seed", str(FIRST_SEED))
+    problem = _run("acmr.evaluation", *arguments)
+    if problem:
+        left_out.append(f"no {EVALUATION_FILE} in {target}: {problem}")
+    return not problem
+
+
+def _run(module: str, *arguments: str) -> str:
+    """Runs a module of the training's side, which the analysis does not load; what it said if it failed, else empty."""
+    done = subprocess.run([sys.executable, "-m", module, *arguments], capture_output=True, text=True, check=False)
+    if not done.returncode:
+        return ""
+    lines = done.stderr.strip().splitlines() or [f"{module} ended with code {done.returncode}"]
+    return lines[-1].removeprefix("error: ")
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """Contents of a JSON file; empty if it is not there or holds no mapping."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _bytes_of(files: dict[str, bytes], names: list[str]) -> int:
+    more = EVALUATION_BYTES if TENSOR_FILE in names else 0
+    return sum(len(files[name]) for name in names) + more
+
+
+def _check_size(out: Path, runs: Path, more: int) -> None:
+    # What is committed is the folder of all profiles; figures that lie beside the runs are not.
+    place = out.resolve()
+    whole = next((folder for folder in (place, *place.parents) if folder.name == "results"), place)
+    total = more + sum(path.stat().st_size for path in whole.glob("**/seed_*/*") if path.is_file())
+    if total > MOST:
+        raise PublishError(
+            f"{os.path.relpath(whole)}: would hold {size(total)} of runs, and {size(MOST)} are the most that a clone "
+            f"should carry; publish fewer of them, as in python -m analysis.publish {runs}/NAME {out}/NAME"
+        )
 
 
 def _packed(path: Path) -> tuple[str, bytes]:
@@ -107,11 +216,12 @@ def _write(path: Path, data: bytes) -> None:
     os.replace(unfinished, path)
 
 
-def _report(added: list[Path], there: list[Path]) -> Iterator[str]:
-    for run in added:
+def _report(done: Published) -> Iterator[str]:
+    for run in done.added:
         yield f"added    {run} ({size(sum(path.stat().st_size for path in run.iterdir()))})"
-    for run in there:
+    for run in done.there:
         yield f"is there {run}"
+    yield from done.left_out
 
 
 @command
@@ -122,7 +232,8 @@ def main() -> int:
     parser.add_argument("out", type=Path, help="where they are added, as results/paper")
     arguments = parser.parse_args()
     try:
-        print("\n".join(_report(*publish(arguments.runs, arguments.out))))
+        done = publish(arguments.runs, arguments.out, say=lambda line: print(line, flush=True))
+        print("\n".join(_report(done)))
     except (OSError, ValueError) as error:
         print(f"analysis.publish: {error}", file=sys.stderr)
         return 2

@@ -27,20 +27,20 @@ ANT = EnvConfig(
 )
 
 
-def make_run(path: Path, core: Dimensions | None = None) -> Path:
+def make_run(path: Path, core: Dimensions | None = None, width: int = 32) -> Path:
     """A finished run whose networks are random."""
     about, env = describe(ANT), make_env(ANT)
     dims = Dimensions(len(about.observation_names), len(about.action_names))
     space = env.action_space
     assert isinstance(space, Box)
     low, high = space.low, space.high
-    architecture = replace(Architecture.plain(dims, (32, 32), low, high), core=core)
+    architecture = replace(Architecture.plain(dims, (width, width), low, high), core=core)
     networks = Networks(architecture, torch.Generator().manual_seed(5))
     path.mkdir(parents=True)
     description = TeacherDescription(
         format_version=FORMAT_VERSION, environment=ANT.name, environment_id=ANT.id, model_hash=about.model_hash,
         observation_names=list(about.observation_names), action_names=list(about.action_names),
-        action_low=low.tolist(), action_high=high.tolist(), hidden_sizes=[32, 32],
+        action_low=low.tolist(), action_high=high.tolist(), hidden_sizes=[width, width],
         core=[core.observation, core.action] if core else None, adapter_activation="relu", log_alpha=0.0, seed=1,
         profile="quick", global_step=100, final_return=None, config={},
     )  # fmt: skip

@@ -21,7 +21,7 @@ def runs(tmp_path: Path) -> Path:
     root = tmp_path / "runs" / "paper"
     for cell, steps in (("H0", 9000), ("A0", 8000)):
         folder = write_run(root, cell, 1, rows_reaching(steps, 20_000), total=20_000)
-        for name in ("teacher.safetensors", "teacher.json", "run.log", "evaluation.json"):
+        for name in ("run.log", "evaluation.json"):
             (folder / name).write_text(name)
         (folder / "checkpoint").mkdir()
     # Long enough to be compressed.
@@ -32,9 +32,9 @@ def runs(tmp_path: Path) -> Path:
 
 def test_what_is_published_is_analyzed_as_the_runs_are(runs, tmp_path):
     out = tmp_path / "results" / "paper"
-    added, there = publish(runs, out)
-    assert len(added) == 3
-    assert there == []
+    done = publish(runs, out)
+    assert len(done.added) == 3
+    assert done.there == []
     shutil.rmtree(run_directory(runs, "A2", 1))
     ours, theirs = load(out), load(runs)
     pd.testing.assert_frame_equal(ours.runs, theirs.runs)
@@ -47,8 +47,7 @@ def test_only_what_others_need_is_published(runs, tmp_path):
     names = {
         cell: sorted(path.name for path in run_directory(tmp_path, cell, 1).glob("*")) for cell in ("H0", "A0", "A1")
     }
-    assert names["A0"] == ["config.yaml", "episodes.csv", "metrics.csv", "summary.json"]
-    assert names["H0"] == [*names["A0"], "teacher.json", "teacher.safetensors"]
+    assert names["A0"] == names["H0"] == ["config.yaml", "episodes.csv", "metrics.csv", "summary.json"]
     assert names["A1"] == ["config.yaml", "episodes.csv.gz", "metrics.csv", "summary.json"]
     assert not run_directory(tmp_path, "A2", 1).exists()
 
@@ -58,9 +57,9 @@ def test_later_runs_are_added_and_others_stay(runs, tmp_path):
     publish(runs, out)
     write_run(runs, "A0", 2, rows_reaching(7000, 20_000), total=20_000)
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
-    added, there = publish(runs, out)
-    assert [path.name for path in added] == ["seed_2"]
-    assert len(there) == 3
+    done = publish(runs, out)
+    assert [path.name for path in done.added] == ["seed_2"]
+    assert len(done.there) == 3
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 

@@ -77,7 +77,11 @@ def limit(config: EnvConfig) -> int | None:
 
 
 def report(episodes: Sequence[Episode], **about: Any) -> dict[str, Any]:
-    """What ``evaluation.json`` says; the standard deviation is that of these episodes (divided by their number)."""
+    """What ``evaluation.json`` says.
+
+    The standard deviation is that of these episodes (divided by their number); the fall rate is the share of those that
+    the environment ended, not its time limit: of a robot, because it fell.
+    """
     returns = [episode.episodic_return for episode in episodes]
     lengths = [episode.episode_length for episode in episodes]
     velocities = [value for episode in episodes if (value := episode.mean_forward_velocity) is not None]
@@ -90,6 +94,7 @@ def report(episodes: Sequence[Episode], **about: Any) -> dict[str, Any]:
         "max_return": float(np.max(returns)),
         "mean_length": float(np.mean(lengths)),
         "mean_forward_velocity": float(np.mean(velocities)) if velocities else None,
+        "fall_rate": float(np.mean([episode.terminated for episode in episodes])),
         "each": [asdict(episode) for episode in episodes],
     }
 
@@ -124,11 +129,13 @@ def evaluate(given: argparse.Namespace) -> None:
         policy="stochastic" if given.stochastic else "deterministic",
         seed=given.seed,
         sha256=teacher.description.sha256,
+        precision=teacher.description.precision,
         same_robot=remark is None,
     )
     print(
         f"mean {content['mean_return']:,.1f}  standard deviation {content['std_return']:,.1f}"
         f"{_velocity(content['mean_forward_velocity'])}  over {len(episodes)} episodes, {content['policy']} policy"
+        f"  ({content['fall_rate']:.0%} ended before their time limit)"
     )
     path = given.out or given.run_dir / EVALUATION_FILE
     try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,10 @@ from acmr.storage.durable import write_bytes
 from acmr.storage.json_files import write_json
 
 FORMAT_VERSION = 1
+#: What numbers a tensor file may hold: those of a run, and those of one that is published in half the bytes.
+FULL, HALF = "float32", "float16"
+#: Entries of a description that are written only where they say something.
+_OPTIONAL = ("precision", "full_sha256")
 #: Files larger than this, and layers wider, are none of ours.
 _MAX_DESCRIPTION_BYTES, _MAX_TENSOR_BYTES, _MAX_WIDTH = 4 << 20, 1 << 30, 1 << 20
 
@@ -55,6 +59,8 @@ class TeacherDescription:
         config: All settings of the run.
         sha256: Of the tensor file.
         description_sha256: Of all other entries of this description.
+        precision: Of the numbers in the tensor file.
+        full_sha256: Of the tensor file in full precision that this one was rounded from; empty for a full one.
     """
 
     format_version: int
@@ -76,6 +82,8 @@ class TeacherDescription:
     config: dict[str, Any]
     sha256: str = ""
     description_sha256: str = ""
+    precision: str = FULL
+    full_sha256: str = ""
 
     @property
     def dims(self) -> Dimensions:
@@ -97,7 +105,7 @@ class TeacherDescription:
 
 @dataclass(frozen=True)
 class Teacher:
-    """A loaded teacher: its file, its description and the tensors by ``<layer>.weight`` and ``<layer>.bias``."""
+    """A loaded teacher: its file, its description, its tensors (float32) by ``<layer>.weight`` and ``<layer>.bias``."""
 
     path: Path
     description: TeacherDescription
@@ -113,8 +121,27 @@ class Teacher:
 def save_teacher(folder: Path, networks: Networks, description: TeacherDescription) -> None:
     """Writes both files of a teacher, each whole or not at all."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in networks.state_dict().items()}
+    _write(folder, tensors, description)
+
+
+def save_halved(folder: Path, teacher: Teacher) -> None:
+    """Writes both files of a teacher with its numbers rounded to half precision, for half the bytes.
+
+    Raises:
+        ConfigError: If a number is too large for that.
+    """
+    tensors = {name: tensor.half() for name, tensor in teacher.tensors.items()}
+    if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
+        raise ConfigError(f"{teacher.path}: holds numbers that half precision does not; keep it in full")
+    full = teacher.description.full_sha256 or teacher.description.sha256
+    _write(folder, tensors, replace(teacher.description, precision=HALF, full_sha256=full))
+
+
+def _write(folder: Path, tensors: dict[str, Tensor], description: TeacherDescription) -> None:
     data = save_tensors(tensors)
     content = asdict(description) | {"sha256": hashlib.sha256(data).hexdigest()}
+    if description.precision == FULL:
+        del content["precision"], content["full_sha256"]
     content["description_sha256"] = _description_sha256(content)
     # The description last: it names the hash of the tensors, so a kill in between leaves a pair that is refused.
     write_bytes(folder / TENSOR_FILE, data)
@@ -140,7 +167,7 @@ def load_teacher(path: str | Path) -> Teacher:
     beside = path.with_suffix(".json")
     if given.is_dir() and not path.exists():
         raise ConfigError(
-            f"{given}: no {TENSOR_FILE} in it; a run writes it at its end, and of published runs only H0 has it"
+            f"{given}: no {TENSOR_FILE} in it; a run writes it at its end, and not every published run has it"
         )
     if not path.is_file():
         raise ConfigError(f"{path}: no such teacher file; give a finished run's directory or its {TENSOR_FILE}")
@@ -165,7 +192,9 @@ def load_teacher(path: str | Path) -> Teacher:
             f"{path}: the tensors do not fit the layers that {DESCRIPTION_FILE} describes; "
             "the two files are not of one run"
         )
-    return Teacher(path, description, tensors)
+    if {str(tensor.dtype) for tensor in tensors.values()} != {f"torch.{description.precision}"}:
+        raise ConfigError(f"{path}: not of the precision that {DESCRIPTION_FILE} says ({description.precision})")
+    return Teacher(path, description, {name: tensor.float() for name, tensor in tensors.items()})
 
 
 def _read_description(path: Path) -> TeacherDescription:
@@ -177,15 +206,15 @@ def _read_description(path: Path) -> TeacherDescription:
         raise ConfigError(f"{path}: not readable as JSON ({error})") from error
     if not isinstance(content, dict) or content.get("format_version") != FORMAT_VERSION:
         raise ConfigError(f"{path}: not a teacher description of format {FORMAT_VERSION}")
-    names = [entry.name for entry in fields(TeacherDescription) if entry.name != "description_sha256"]
+    names = [entry.name for entry in fields(TeacherDescription) if entry.name not in (*_OPTIONAL, "description_sha256")]
     missing = [name for name in names if name not in content]
     if missing:
         raise ConfigError(f"{path}: the entries {', '.join(missing)} are missing")
-    if unknown := content.keys() - {*names, "description_sha256"}:
+    if unknown := content.keys() - {*names, *_OPTIONAL, "description_sha256"}:
         raise ConfigError(f"{path}: damaged (it has the unknown entries {', '.join(sorted(unknown))}); copy it again")
     if content.get("description_sha256", _description_sha256(content)) != _description_sha256(content):
         raise ConfigError(f"{path}: damaged (its entries do not have the sha256 that stands in it); copy it again")
-    description = TeacherDescription(**{name: content[name] for name in names})
+    description = TeacherDescription(**{name: content[name] for name in (*names, *_OPTIONAL) if name in content})
     wrong = _wrong_entries(description)
     if wrong:
         raise ConfigError(f"{path}: the entries {', '.join(wrong)} are not what a teacher description holds")
@@ -210,7 +239,7 @@ def _wrong_entries(about: TeacherDescription) -> list[str]:
         fits = list_of(value, float) and isinstance(value, list) and len(value) == len(about.action_names)
         return fits and isinstance(value, list) and all(math.isfinite(entry) for entry in value)
 
-    texts = ("environment", "environment_id", "model_hash", "profile", "sha256")
+    texts = ("environment", "environment_id", "model_hash", "profile", "sha256", "full_sha256")
     good = {
         "observation_names": list_of(about.observation_names, str),
         "action_names": list_of(about.action_names, str),
@@ -224,6 +253,7 @@ def _wrong_entries(about: TeacherDescription) -> list[str]:
         "final_return": about.final_return is None or isinstance(about.final_return, int | float),
         "adapter_activation": about.adapter_activation in ACTIVATIONS,
         "config": isinstance(about.config, dict),
+        "precision": about.precision in (FULL, HALF),
         **{name: isinstance(getattr(about, name), str) for name in texts},
     }
     return [name for name, is_good in good.items() if not is_good]
