@@ -1,9 +1,17 @@
-"""Errors, durations and sizes as text for the user; the standard library only, so that every part may use it."""
+"""Errors, durations, sizes and names as text for the user; the standard library only, so that all may use it."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from itertools import takewhile
+
 #: Characters of an error's message that are shown; a server's answer or a list of names can fill pages.
 LONGEST_MESSAGE = 400
+#: Columns of a pipe or a file, where nothing has to fit.
+UNLIMITED = 10_000
+#: Where a run's name may be parted: before a setting, but not within a number such as 1e-05.
+_PARTS, _SEPARATORS = re.compile(r"(?=-[A-Za-z]|  |/)"), "- /"
 
 
 def message(error: BaseException) -> str:
@@ -37,3 +45,52 @@ def size(count: float) -> str:
     if count >= 1e9:
         return f"{count / 1e9:.1f} GB"
     return f"{count / 1e6:.{0 if count >= 1e8 else 1}f} MB"
+
+
+def shorten(names: Sequence[str], width: int, mark: str = "…") -> list[str]:
+    """Names of at most ``width`` characters, cut in the middle so that they can be told apart, if that is possible."""
+    if max(map(len, names), default=0) <= width:
+        return list(names)
+    short = _fit(list(dict.fromkeys(names)), width, mark)
+    return [short[name] for name in names]
+
+
+def _fit(names: Sequence[str], width: int, mark: str) -> dict[str, str]:
+    """A short version of each name; they are different names."""
+    parts = _what_differs(names, mark)
+    # All are cut at the same place: in the middle or, if that makes them all alike, where most can be told apart.
+    places = sorted(range(width), key=lambda place: abs(place - width // 2))
+    candidates = [{name: _cut(*parts[name], place, width, mark) for name in names} for place in places]
+    best = candidates[0]
+    if len(set(best.values())) == 1:
+        best = max(candidates, key=lambda short: len(set(short.values())))
+    alike: dict[str, list[str]] = {}
+    for name, short in best.items():
+        alike.setdefault(short, []).append(name)
+    for group in alike.values():
+        # Runs of one kind that differ in one setting begin and end alike; among them other parts matter.
+        if 1 < len(group) < len(names):
+            best |= _fit(group, width, mark)
+    return best
+
+
+def _what_differs(names: Sequence[str], mark: str) -> dict[str, tuple[str, str]]:
+    """For each name how it begins where all do, and the rest, with a mark for the parts that all have."""
+    found = {}
+    parts = {name: _PARTS.split(name) for name in names}
+    common = set.intersection(*map(set, parts.values()))
+    for name, own in parts.items():
+        start = "".join(takewhile(common.__contains__, own))
+        rest = "".join("\0" if part in common else part for part in own).lstrip("\0")
+        # A name that the others go on from has nothing of its own.
+        found[name] = (start, re.sub("\0+[- /]*", mark, rest)) if rest else ("", name)
+    return found
+
+
+def _cut(start: str, rest: str, place: int, width: int, mark: str) -> str:
+    if len(start) + len(rest) <= width:
+        return start + rest
+    rest = rest.lstrip(_SEPARATORS)
+    if len(rest) < width:
+        return start[: width - 1 - len(rest)] + mark + rest
+    return f"{rest[:place]}{mark}{rest[len(rest) - (width - 1 - place) :]}"

@@ -18,8 +18,9 @@ from rich.text import Text
 from test_sweeps_status import ended, heartbeat
 
 from acmr.records import COMPLETE, FAILED, RUNNING
+from acmr.text import shorten
 from sweeps.folder import WAITING
-from sweeps.table import reasons, run_table, shorten
+from sweeps.table import reasons, run_table
 from sweeps.view import BLOCKED, LOST, RunStatus
 
 RATES = [f"ant_three_legs-none-hidden_sizes=16+16-q_lr={rate}-total_timesteps=1000000" for rate in ("1e-05", "0.0003")]
@@ -63,6 +64,13 @@ def test_state_speed_time_left_and_return_are_whole_at_any_width(width):
     for view, words in zip(VIEWS, kept, strict=True):
         assert view.state in words
     assert len({line.split()[0] for line in lines[:3]}) == 3, "three rates, three names"
+
+
+@pytest.mark.parametrize("width", [20, 25, 30, 35])
+def test_the_state_is_whole_where_there_is_room_for_little_else(width):
+    for view, line in zip(VIEWS, printed(width)[1:], strict=True):
+        assert view.state in line.split()
+        assert len(line) <= width
 
 
 def test_with_room_enough_names_are_whole_and_steps_are_told():

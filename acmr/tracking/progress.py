@@ -16,7 +16,7 @@ from rich.text import Text
 from acmr.config import THRESHOLD
 from acmr.records import EpisodeRecord
 from acmr.settings.run_spec import RunSpec
-from acmr.text import duration
+from acmr.text import UNLIMITED, duration
 from acmr.tracking.observer import Observer, Say
 
 #: Seconds between two drawings of the bar, and between two lines.
@@ -195,7 +195,9 @@ class BarProgress(RunProgress):
     interval = BAR_INTERVAL
 
     def __init__(self, spec: RunSpec, start_step: int = 0, console: Console | None = None) -> None:
-        super().__init__(spec, start_step, console=console or Console())
+        # Where it is no terminal but a bar was asked for, nothing has to fit.
+        console = console or Console(width=None if sys.stdout.isatty() else UNLIMITED)
+        super().__init__(spec, start_step, console=console)
         terminals = {stream: name for name in ("stdout", "stderr") if (stream := getattr(sys, name)).isatty()}
         self._progress.start()
         # Left hidden, it would stay so after a kill.

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
+from acmr.text import UNLIMITED, shorten
 from analysis.loading.missing import Missing
 from analysis.loading.read_run import UNFINISHED
 
 #: Missing runs named one by one; more are only counted.
 MOST_NAMED = 6
+#: Columns of the summary beside the group and how many of its runs reached the threshold.
+_NUMBERS = ("mean", "SD", "against", "t", "p", "log-rank p")
+#: Those that make room for names in a narrow terminal, the least important first, and the least room for names.
+_LEAST, _SHORT_NAME, _SHORTEST_NAME = ("t", "SD", "against", "log-rank p", "p"), 16, 4
+#: Behind a mean that flatters.
+_BIASED = " (biased)"
+#: Characters between two columns.
+_GAP = 2
 
 
 def print_summary(cells: pd.DataFrame, comparisons: pd.DataFrame, title: str, console: Console | None = None) -> None:
@@ -26,23 +36,44 @@ def print_summary(cells: pd.DataFrame, comparisons: pd.DataFrame, title: str, co
         title: Heading.
         console: Where to; None: the terminal.
     """
-    console = console or Console(highlight=False)
-    table = Table(box=None, pad_edge=False)
-    table.add_column("cell")
-    for name in ("reached", "mean", "SD", "against", "t", "p", "log-rank p"):
-        table.add_column(name, justify="right")
+    console = console or Console(highlight=False, width=None if sys.stdout.isatty() else UNLIMITED)
+    rows = _rows(cells, comparisons)
+    columns = {header: [row[header] for row in rows] for header in ("reached", *_NUMBERS)}
+    names = [row["cell"] for row in rows]
+    for header in _LEAST:
+        if _room(columns, console) < min(_SHORT_NAME, max(map(len, names), default=0)):
+            del columns[header]
+    marks = [_BIASED if biased else "" for biased in cells["biased"]]
+    room = max(_room(columns, console) - max(map(len, marks), default=0), _SHORTEST_NAME)
+    names = shorten(names, room, "~" if console.options.ascii_only else "…")
+    table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
+    table.add_column("cell", no_wrap=True)
+    for header in columns:
+        table.add_column(header, justify="right", no_wrap=True)
+    for name, mark, *values in zip(names, marks, *columns.values(), strict=True):
+        # As texts, because a name may hold what looks like rich's markup.
+        table.add_row(*map(Text, (name + mark, *values)))
+    console.print(Text(title, style="bold"), soft_wrap=True)
+    console.print(table)
+
+
+def _rows(cells: pd.DataFrame, comparisons: pd.DataFrame) -> list[dict[str, str]]:
     tests = {row["index"]: row for row in comparisons.to_dict("records")}
+    rows = []
     for row in cells.to_dict("records"):
-        numbers = [""] * 4
+        numbers = dict.fromkeys(_NUMBERS, "")
+        numbers |= {"mean": _steps(row["mean"]), "SD": _steps(row["std"])}
         test = tests.get(row["group"])
         if test and test["runs_reference"] and test["runs_index"]:
-            values = (_decimal(test[name]) for name in ("t_score", "p_value", "p_log_rank"))
-            numbers = [test["reference"], *values]
-        reached = f"{row['reached']} of {row['runs']}"
-        name = f"{row['group']} (biased)" if row["biased"] else row["group"]
-        table.add_row(escape(name), reached, _steps(row["mean"]), _steps(row["std"]), *numbers)
-    console.print(f"[bold]{escape(title)}[/bold]")
-    console.print(table)
+            numbers |= {"against": test["reference"], "t": _decimal(test["t_score"]), "p": _decimal(test["p_value"])}
+            numbers["log-rank p"] = _decimal(test["p_log_rank"])
+        rows.append({"cell": row["group"], "reached": f"{row['reached']} of {row['runs']}", **numbers})
+    return rows
+
+
+def _room(columns: dict[str, list[str]], console: Console) -> int:
+    """Characters that the other columns leave for the names."""
+    return console.width - sum(_GAP + max(map(len, [header, *cells])) for header, cells in columns.items())
 
 
 def missing_lines(missing: Sequence[Missing], planned: int, command: str) -> list[str]:
