@@ -12,8 +12,9 @@ import pytest
 from gymnasium.spaces import Box
 from torture import SMALL, Run
 
-from acmr.config import ConfigError
+from acmr.config import ConfigError, EnvConfig
 from acmr.envs import make_env
+from acmr.evaluation.cli import main as evaluate
 from acmr.settings.compose import environment_config
 from sweeps.status import main as status
 
@@ -103,6 +104,48 @@ def test_a_run_whose_environment_was_mended_goes_on_as_if_nothing_had_been(tmp_p
     assert run.outcome() == whole.outcome()
     assert json.loads((run.folder / "status.json").read_text())["state"] == "complete"
     assert "cause" not in json.loads((run.folder / "status.json").read_text())
+
+
+class Unmade(Failing):
+    """Cannot be made."""
+
+    def __init__(self, error: str) -> None:
+        raise {"exit": SystemExit(0), "value": ValueError("no\nrobot"), "key": KeyError("arm")}[error]
+
+
+gym.register("AcmrUnmade-v0", Unmade)
+
+
+@pytest.mark.parametrize(
+    ("error", "says"), [("exit", "SystemExit: 0"), ("value", "ValueError: no robot"), ("key", "KeyError: 'arm'")]
+)
+def test_an_environment_that_cannot_be_made_is_refused_in_one_line(error: str, says: str) -> None:
+    config = EnvConfig("unmade", "AcmrUnmade-v0", "unmade", kwargs={"error": error})
+    with pytest.raises(ConfigError, match=rf"cannot run: {says} \(test_faults_environment.py:\d+\)$") as caught:
+        make_env(config)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("code", ["raise SystemExit(0)", "import no_such_thing", "1 / 0", "def ("])
+def test_a_module_that_cannot_be_imported_is_refused(code: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    name = f"broken_{abs(hash(code))}"
+    (tmp_path / f"{name}.py").write_text(code)
+    with pytest.raises(ConfigError, match=f"env.id={name}:Robot-v0: cannot import {name}: "):
+        make_env(EnvConfig("broken", f"{name}:Robot-v0", "broken"))
+
+
+def test_an_evaluation_says_in_one_line_what_the_environment_raised(
+    tmp_path: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Simulator, "mended", True)
+    run = failing(tmp_path, "raise")
+    assert run().code == 0
+    monkeypatch.setattr(Simulator, "mended", False)
+    assert evaluate([str(run.folder), "--episodes", "9"]) == 2
+    shown = capsys.readouterr()
+    assert shown.out.count("return") == 4
+    assert re.fullmatch(rf"error: env.id=AcmrFailing-v0: {HOW['raise']}\n", shown.err)
 
 
 def test_any_other_error_is_a_failure_with_its_cause_too(tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,19 @@ def test_what_memory_cannot_take_is_refused_before_anything_is_made(
     assert str(caught.value).startswith(named)
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "runs").glob("*/"))
+
+
+def test_a_limit_of_the_shell_is_one_line_too(tmp_path: Path) -> None:
+    def limit() -> None:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        held = pages * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (held + 100 * MEBI, resource.RLIM_INFINITY))
+
+    run = Run(tmp_path, (*PENDULUM, "agent.buffer_size=10000000", "total_timesteps=10000000"))
+    ended = run(limit)
+    assert ended.code == 2, ended.said
+    assert "error: agent.buffer_size=10000000: Unable to allocate" in ended.said
+    assert "Traceback" not in ended.said
 
 
 def test_memory_is_what_is_free_and_not_what_the_machine_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from gymnasium.spaces import Box
 
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs.bodies import without_bodies
-from acmr.envs.conversion import ConvertedEnv, FaultyEnvironmentError
+from acmr.envs.conversion import ConvertedEnv, FaultyEnvironmentError, place_of
 from acmr.envs.spaces import is_usable
 from acmr.envs.wrappers import near_matches
 from acmr.text import one_line
@@ -41,7 +41,7 @@ def find_spec(env_id: str) -> EnvSpec:
     if module:
         try:
             importlib.import_module(module)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ConfigError(f"env.id={env_id}: cannot import {module}: {one_line(error)}") from error
     spec = gym.registry.get(name)
     if spec is None or _is_stub(spec):
@@ -88,13 +88,13 @@ def construct(config: EnvConfig, render_mode: str | None = None) -> ConvertedEnv
             env = gym.make(spec, max_episode_steps=config.max_episode_steps, disable_env_checker=True, **kwargs)
         except ConfigError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ConfigError(_reason(config, creator, error)) from error
     _check_spaces(config.id, env)
     return ConvertedEnv(env, config.id)
 
 
-def cannot_run(config: EnvConfig, error: Exception) -> ConfigError:
+def cannot_run(config: EnvConfig, error: BaseException) -> ConfigError:
     """The error of an environment that was built but cannot be reset or stepped."""
     given = [f"env.id={config.id}"]
     if config.kwargs:
@@ -104,7 +104,9 @@ def cannot_run(config: EnvConfig, error: Exception) -> ConfigError:
     # What a missing body, site or joint looks like in the environment's own code.
     needed = config.remove_bodies and isinstance(error.__cause__ or error, LookupError)
     why = "its own code needs a part that is gone" if needed else "this environment cannot run"
-    reason = error.reason if isinstance(error, FaultyEnvironmentError) else one_line(error)
+    place = place_of(error)
+    raised = f"{one_line(error)} ({place})" if place else one_line(error)
+    reason = error.reason if isinstance(error, FaultyEnvironmentError) else raised
     return ConfigError(f"{' '.join(given)}: {why}: {reason}")
 
 
@@ -131,7 +133,7 @@ def _creator(spec: EnvSpec) -> Any:
         return spec.entry_point
     try:
         return load_env_creator(spec.entry_point)
-    except (ImportError, gym.error.Error) as error:
+    except (Exception, SystemExit) as error:
         raise ConfigError(f"env.id={spec.id}: {one_line(error)}") from error
 
 
@@ -140,7 +142,7 @@ def _is_stub(spec: EnvSpec) -> bool:
     return inspect.isfunction(spec.entry_point) and spec.entry_point.__name__.startswith("_raise")
 
 
-def _reason(config: EnvConfig, creator: Any, error: Exception) -> str:
+def _reason(config: EnvConfig, creator: Any, error: BaseException) -> str:
     unknown = re.search(r"(?:unexpected keyword|multiple values for(?: keyword)?) argument '(\w+)'", str(error))
     if unknown and unknown[1] in config.kwargs:
         allowed = [

@@ -164,11 +164,10 @@ class ConvertedEnv(gym.Wrapper[np.ndarray, np.ndarray, Any, Any]):
         return info
 
     def _raised(self, method: str, error: BaseException) -> FaultyEnvironmentError:
-        frame = _place(error)
-        place = f" ({os.path.basename(frame.filename)}:{frame.lineno}, in {method})" if frame else f" (in {method})"
+        place = place_of(error)
         # Where no code of the environment raised it, it was the attempt to take apart what the environment returned.
-        hint = f"; {_RETURNS[method]}" if frame is None else ""
-        return self.fault(f"{one_line(error)}{place}{hint}")
+        where, hint = (f"{place}, in {method}", "") if place else (f"in {method}", f"; {_RETURNS[method]}")
+        return self.fault(f"{one_line(error)} ({where}){hint}")
 
 
 def is_kept(key: object) -> bool:
@@ -199,11 +198,11 @@ def _shown(given: Any) -> str:
     return f"{type(given).__name__} {text if len(text) <= 60 else text[:57] + '...'}"
 
 
-def _place(error: BaseException) -> traceback.FrameSummary | None:
-    """The innermost line of the environment's own code, or of the library that it is part of."""
+def place_of(error: BaseException) -> str | None:
+    """File and line (``cart.py:41``) of the innermost of the environment's own code, or of its library."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _only_passes_on(frame.filename)]
     own = [frame for frame in frames if not frame.filename.startswith(_LIBRARIES)] or frames
-    return own[-1] if own else None
+    return f"{os.path.basename(own[-1].filename)}:{own[-1].lineno}" if own else None
 
 
 def _only_passes_on(file: str) -> bool:

@@ -11,15 +11,17 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from acmr.agent.architecture import Dimensions
 from acmr.agent.learner import Learner
 from acmr.agent.replay_buffer import ReplayBuffer
-from acmr.config import THRESHOLD, ConfigError
+from acmr.config import THRESHOLD, ConfigError, ExperimentConfig
 from acmr.envs.conversion import FaultyEnvironmentError
 from acmr.records import EpisodeInProgress
 from acmr.run.preparation import Prepared
 from acmr.run.random_streams import RandomStreams
 from acmr.run.run_logs import RunLogs
 from acmr.stateful import State
+from acmr.text import message
 from acmr.tracking.observer import Observer
 
 
@@ -195,17 +197,26 @@ def make_trainer(prepared: Prepared, env: gym.Env[np.ndarray, np.ndarray], logs:
     """
     config, streams, about = prepared.spec.config, prepared.streams, prepared.about
     dims = prepared.networks.dims
-    # What the run cannot fill it need not ask for; which transitions are drawn is the same.
-    capacity = min(config.agent.buffer_size, config.most_steps)
     return Trainer(
         env=env,
         agent=prepared.learner(
             prepared.networks, config.agent, streams.acting, streams.learning, prepared.log_alpha, config.device
         ),
-        buffer=ReplayBuffer(capacity, dims.observation, dims.action, config.device),
+        buffer=_make_buffer(config, dims),
         streams=streams,
         total_timesteps=config.most_steps,
         log_every=config.log_every,
         episode=EpisodeInProgress(about.reward_terms, about.has_forward_velocity),
         is_satisfied=lambda: config.stop == THRESHOLD and logs.meet(config.threshold, config.consecutive),
     )
+
+
+def _make_buffer(config: ExperimentConfig, dims: Dimensions) -> ReplayBuffer:
+    # What the run cannot fill it need not ask for; which transitions are drawn is the same.
+    capacity = min(config.agent.buffer_size, config.most_steps)
+    try:
+        return ReplayBuffer(capacity, dims.observation, dims.action, config.device)
+    except MemoryError as error:
+        # There is enough, but this process may not have it: a limit of the shell or of the system.
+        size = f"agent.buffer_size={config.agent.buffer_size}"
+        raise ConfigError(f"{size}: {message(error)}; type a smaller agent.buffer_size, or lift the limit") from error
