@@ -1,7 +1,8 @@
 """Fixtures for many tests."""
 
 import signal
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,14 @@ for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHU
 # How long an example takes depends on who shares the machine.
 settings.register_profile("acmr", deadline=None)
 settings.load_profile("acmr")
+
+
+@pytest.fixture(autouse=True)
+def _settings_of_the_project() -> Iterator[None]:
+    """What a command line says of places of settings files holds for one test."""
+    yield
+    if "acmr.settings.compose" in sys.modules:
+        sys.modules["acmr.settings.compose"]._given = None
 
 
 @pytest.fixture
