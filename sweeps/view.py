@@ -184,11 +184,12 @@ def _told(status: dict[str, Any], state: State, alive: bool) -> tuple[str, str]:
     if alive:
         return RUNNING, ""
     # Where a sweep has more to do with it, what became of an earlier attempt says nothing of how it stands.
+    cause = str(status.get("cause") or "")
     if status.get("state") == FAILED and state == State(STOPPED):
-        return FAILED, str(status.get("cause") or "")
+        return FAILED, cause
     if status.get("state") == RUNNING:
         return LOST, "its process is gone; the command that started it goes on with it"
-    return (STOPPED if status else state.state), state.reason
+    return (STOPPED if status else state.state), state.reason or cause
 
 
 def _is_alive(status: dict[str, Any]) -> bool:

@@ -193,7 +193,10 @@ def test_a_disk_that_refuses_a_row_ends_the_run_and_closes_all(tmp_path: Path) -
     # What is not in the run's own record is shown nowhere.
     recorded = (run.folder / "episodes.csv").read_text().splitlines()[1:]
     assert [entry[1] for entry in told if entry[0] == "episode"] == [int(row.split(",")[0]) for row in recorded]
-    assert json.loads((run.folder / "status.json").read_text())["state"] == "stopped"
+    status = json.loads((run.folder / "status.json").read_text())
+    assert status["state"] == "stopped"
+    assert "free some space there" in status["cause"]
+    assert " error: " in (run.folder / "run.log").read_text().splitlines()[-1]
 
 
 def test_a_run_that_is_stopped_has_shown_its_last_step(tmp_path: Path) -> None:

@@ -28,13 +28,14 @@ from acmr.records import (
     LOG_FILE,
     METRICS_FILE,
     STATUS_FILE,
+    STOPPED,
     SUMMARY_FILE,
     TENSOR_FILE,
     TRANSFER_FILE,
     DamagedError,
     ended_state,
 )
-from acmr.storage.durable import read_regular, remove, remove_leftovers, sync_folder, write_bytes
+from acmr.storage.durable import StorageError, read_regular, remove, remove_leftovers, sync_folder, write_bytes
 from acmr.storage.json_files import read_json, replace_json, write_json
 from acmr.storage.processes import is_alive
 from acmr.text import message, one_line
@@ -150,7 +151,9 @@ class RunDir:
             # What is not meant for the user has a message that says little without its type.
             cause = message(error) if isinstance(error, ConfigError) else one_line(error)
             note(f"error: {cause}")
-            self._note_failure(cause.removeprefix(f"{self.path}: "))
+            # Where the disk was full nothing is wrong with the run, which waits for space.
+            state = STOPPED if isinstance(error, StorageError) else FAILED
+            self._note_end(state, cause.removeprefix(f"{self.path}: "))
             raise
         finally:
             os.close(descriptor)
@@ -184,13 +187,13 @@ class RunDir:
         finally:
             os.close(descriptor)
 
-    def _note_failure(self, cause: str) -> None:
+    def _note_end(self, state: str, cause: str) -> None:
         path = self.path / STATUS_FILE
         status = read_json(path)
         # What another process said of the run stays true where this one has refused to go on with it.
         if status is not None and status.get("process") == os.getpid():
             with suppress(OSError):
-                replace_json(path, status | {"state": FAILED, "cause": cause})
+                replace_json(path, status | {"state": state, "cause": cause})
 
     def _open(self, path: Path, flags: int) -> int:
         try:
