@@ -11,12 +11,13 @@ from typing import NoReturn
 
 from acmr.cells import REFERENCE
 from acmr.command import command
+from acmr.names import terminal
 from analysis import FORMATS
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"analysis: {message} (python -m analysis --help)\n")
+        self.exit(2, terminal(f"analysis: {message} (python -m analysis --help)") + "\n")
 
 
 @command
@@ -37,9 +38,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return run(options)
     except InputError as error:
-        print(f"analysis: {error}", file=sys.stderr)
+        print(terminal(f"analysis: {error}"), file=sys.stderr)
     except OSError as error:
-        print(f"analysis: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
+        print(terminal(f"analysis: {error.filename or options.out}: {error.strerror or error}"), file=sys.stderr)
     return 2
 
 

@@ -7,6 +7,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from acmr.names import terminal
 from analysis.analyze import Analysis, analyze
 from analysis.loading.load import load
 from analysis.loading.missing import matrix_command, missing_runs, planned_seeds, profile_of
@@ -20,14 +21,14 @@ def run(options: argparse.Namespace) -> int:
     lines = missing_lines(missing, planned, matrix_command(data))
     if not len(data.episodes):
         said = [f"{options.runs}: no run with episodes to analyze", *left_out_lines(data.runs), *lines]
-        print("\n".join(said), file=sys.stderr)
+        print("\n".join(map(terminal, said)), file=sys.stderr)
         return 1
     analysis = analyze(data, options.threshold, options.consecutive, options.reference)
     closing = [] if options.summary else _write(analysis, options)
     title = f"Steps to threshold {analysis.threshold:g} ({analysis.consecutive} episodes in a row), {profile_of(data)}"
     print_summary(analysis.cells, analysis.comparisons, title)
     biases = dict.fromkeys(filter(None, analysis.measured["bias"]))
-    print("\n".join(["", *biases, *left_out_lines(analysis.measured), *lines, *closing]))
+    print("\n".join(map(terminal, ["", *biases, *left_out_lines(analysis.measured), *lines, *closing])))
     return 0
 
 
@@ -40,10 +41,10 @@ def _write(analysis: Analysis, options: argparse.Namespace) -> list[str]:
     value = fingerprint(analysis.data, out, asked)
     if options.if_changed and is_current(out, value):
         return [f"results: {out}/ (nothing has changed since they were written)", f"report:  {out / 'report.html'}"]
-    from analysis.report.write import write_results
+    from analysis.report.folder import new_results
+    from analysis.report.write import REPLACED, write_results
 
-    (out / STAMP).unlink(missing_ok=True)
-    with tempfile.TemporaryDirectory() as scratch:
-        written = write_results(analysis, out, options, Path(scratch))
-    (out / STAMP).write_text(value + "\n", encoding="utf-8")
+    with tempfile.TemporaryDirectory() as scratch, new_results(out, REPLACED) as folder:
+        written = write_results(analysis, folder, out, options, Path(scratch))
+        (folder / STAMP).write_text(value + "\n", encoding="utf-8")
     return [*written.left_out, *result_lines(out, written.tables, written.figures)]

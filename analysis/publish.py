@@ -21,6 +21,7 @@ from typing import Any
 from acmr.cells import CELLS
 from acmr.command import command
 from acmr.config import THRESHOLD
+from acmr.names import terminal
 from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
@@ -232,10 +233,10 @@ def main() -> int:
     parser.add_argument("out", type=Path, help="where they are added, as results/paper")
     arguments = parser.parse_args()
     try:
-        done = publish(arguments.runs, arguments.out, say=lambda line: print(line, flush=True))
-        print("\n".join(_report(done)))
+        done = publish(arguments.runs, arguments.out, say=lambda line: print(terminal(line), flush=True))
+        print("\n".join(map(terminal, _report(done))))
     except (OSError, ValueError) as error:
-        print(f"analysis.publish: {error}", file=sys.stderr)
+        print(terminal(f"analysis.publish: {error}"), file=sys.stderr)
         return 2
     return 0
 

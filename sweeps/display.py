@@ -12,6 +12,7 @@ from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
+from acmr.names import terminal
 from acmr.records import COMPLETE, DIVERGED, ENDED, FAILED, RUNNING, STOPPED
 from acmr.text import duration, size
 from sweeps.estimate import Estimate
@@ -46,10 +47,10 @@ class Display:
         # Reading the files of many runs takes time from the trainings.
         self._interval = 1.0 if len(entries) <= 100 else 5.0
         self._console = make_console()
-        terminal = sys.stdout.isatty() and os.environ.get("TERM") not in (None, "", "dumb")
+        live = sys.stdout.isatty() and os.environ.get("TERM") not in (None, "", "dumb")
         self.refresh()
         self._first_steps = self._steps()
-        self._live = Live(self._drawing(), console=self._console, auto_refresh=False) if terminal else None
+        self._live = Live(self._drawing(), console=self._console, auto_refresh=False) if live else None
         if self._live is not None:
             self._live.start(refresh=True)
             # Left hidden, it would stay so after a kill.
@@ -172,7 +173,7 @@ def print_plan(plan: Plan, needs: Estimate, workers: int, output_dir: Path) -> N
 
 
 def _sentence(view: RunStatus, detail: str) -> str:
-    return f"{view.state}  {view.name} seed {view.seed}{f': {detail}' if detail else ''}"
+    return terminal(f"{view.state}  {view.name} seed {view.seed}{f': {detail}' if detail else ''}")
 
 
 def _remark(run: PlannedRun) -> str:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from acmr.command import command
+from acmr.names import terminal
 from acmr.records import CONFIG_FILE, FAILED, RUNNING, SEED_FOLDER, STATUS_FILE
 from acmr.run_folders import RunFolder, run_folders
 from acmr.text import duration
@@ -87,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         console.print(line, soft_wrap=True)
     for folder in folders:
         if folder.problem:
-            console.print(f"{folder.path}: {folder.problem}", markup=False, soft_wrap=True)
+            console.print(terminal(f"{folder.path}: {folder.problem}"), markup=False, soft_wrap=True)
     running = [view for view in views if view.state == RUNNING]
     speed = sum(view.speed for view in running)
     eta = f"; {speed:,.0f} steps/s, {duration(steps_ahead(views) / speed)} left" if speed else ""

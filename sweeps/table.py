@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from acmr.cells import stops
+from acmr.names import terminal
 from acmr.records import COMPLETE, DIVERGED, FAILED, RUNNING, STOPPED
 from acmr.text import UNLIMITED, duration, shorten
 from sweeps.folder import WAITING
@@ -29,7 +30,7 @@ def make_console() -> Console:
 
 def run_table(views: Sequence[RunStatus], console: Console) -> Table:
     """The runs, one a line; a narrow terminal gets shorter names and no steps, but always state, speed, ETA, return."""
-    names = [view.name for view in views]
+    names = [terminal(view.name) for view in views]
     columns, gap = _columns(views), 2
     if _room(columns, gap, console) < min(_SHORT_NAME, max(map(len, names), default=0)):
         columns, gap = _few_columns(columns), 1
@@ -65,7 +66,7 @@ def reasons(views: Iterable[RunStatus]) -> list[Text]:
     lines = []
     for (state, reason), alike in found.items():
         who = f"{alike[0].name} seed {alike[0].seed}" if len(alike) == 1 else f"{len(alike)} runs"
-        lines.append(Text(f"{state}  {who}: {reason}", style=_COLORS.get(state, "")))
+        lines.append(Text(terminal(f"{state}  {who}: {reason}"), style=_COLORS.get(state, "")))
     return lines
 
 

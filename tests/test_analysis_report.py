@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
@@ -275,7 +276,7 @@ def test_every_link_leads_somewhere(page):
     text = page.read_text()
     links = [link.split("#")[0] for link in re.findall(r'href="([^"]*)"', text) if not link.startswith(("data:", "#"))]
     assert len(links) > 100
-    missing = [link for link in links if not (page.parent / unescape(link)).exists()]
+    missing = [link for link in links if not (page.parent / unquote(unescape(link))).exists()]
     assert not missing
     anchors = re.findall(r'href="#([^"]*)"', text)
     assert all(f'id="{anchor}"' in text for anchor in anchors)

@@ -60,7 +60,7 @@ def test_runs_behind_links_are_found(root, tmp_path, capsys, link):
     assert set(runs["cell"]) == {"A0"}
     assert status([str(root.parent)]) == 0
     assert "2 runs: 2 complete" in capsys.readouterr().out
-    assert len(publish(root, tmp_path / "published")[0]) == 2
+    assert len(publish(root, tmp_path / "published").added) == 2
     assert len(_finished(root)) == 2
 
 
@@ -68,7 +68,7 @@ def test_the_runs_folder_may_be_a_link(root, tmp_path, capsys, monkeypatch):
     (tmp_path / "linked").symlink_to(root)
     (tmp_path / "all").symlink_to(root.parent)
     assert load(tmp_path / "linked").runs.index.tolist() == [f"{NAME}/seed_1"]
-    assert len(publish(tmp_path / "linked", tmp_path / "published")[0]) == 1
+    assert len(publish(tmp_path / "linked", tmp_path / "published").added) == 1
     monkeypatch.chdir(tmp_path)
     assert status(["all"]) == 0
     assert f"paper/{NAME}" in capsys.readouterr().out
@@ -120,7 +120,7 @@ def test_two_ways_to_one_run_are_one_run_under_its_own_path(root, tmp_path, caps
     assert runs["counted"].all()
     assert status([str(root.parent)]) == 0
     assert "1 runs: 1 complete" in capsys.readouterr().out
-    assert len(publish(root, tmp_path / "published")[0]) == 1
+    assert len(publish(root, tmp_path / "published").added) == 1
 
 
 def test_many_folders_that_lead_to_each_other_are_searched_quickly(tmp_path):
@@ -165,7 +165,7 @@ def test_other_words_for_a_run_at_its_end_are_understood(root, tmp_path, capsys,
     write_run(root, "A0", 3, ROWS, total=20_000, summary={"status": word})
     run = load(root).runs.loc[f"{NAME}/seed_3"]
     assert (run["state"], run["counted"]) == ("diverged" if word == "Diverged" else "complete", True)
-    assert len(publish(root, tmp_path / "published")[0]) == 2
+    assert len(publish(root, tmp_path / "published").added) == 2
     status([str(root.parent)])
     assert "stopped" not in capsys.readouterr().out
 

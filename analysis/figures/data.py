@@ -185,7 +185,7 @@ def training_speeds(root: Path, runs: pd.DataFrame, groups: list[str]) -> pd.Dat
     for group in groups:
         for name, run in drawn_runs(runs, group).iterrows():
             starts = run["learning_starts"]
-            own = read_speed(root / str(name), 0.0 if pd.isna(starts) else float(starts))
+            own = read_speed(root / run["directory"], 0.0 if pd.isna(starts) else float(starts))
             parts.append(own.assign(group=group, run=str(name)))
     filled = [part for part in parts if len(part)]
     columns = ["step", "steps_per_second", "group", "run"]

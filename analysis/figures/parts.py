@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from acmr.cells import CELLS, SOURCE, TARGET
+from acmr.names import figure as figure_text
 from analysis.figures.data import MOST_OTHERS, POINTS, FigureData, leaving
-from analysis.figures.style import COLUMN, Palette
+from analysis.figures.style import COLUMN, Palette, letters
 
 #: Height of a row, inches.
 ROW = 0.24
@@ -38,8 +39,9 @@ def step_axis(axis: Axis) -> None:
 
 
 def short_name(group: str) -> str:
-    """A group's name with its middle left out if it is long."""
-    return group if len(group) <= 36 else f"{group[:17]}…{group[-18:]}"
+    """A group's name as figures show it, with its middle left out if it is long."""
+    name = figure_text(group, letters())
+    return name if len(name) <= 36 else f"{name[:17]}…{name[-18:]}"
 
 
 def two_lines(label: str, width: int = 18) -> str:

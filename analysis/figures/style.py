@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import matplotlib as mpl
 import seaborn as sns
+from matplotlib import font_manager
 
 from acmr.cells import CELLS
 
+FONT = "DejaVu Sans"
 #: Width of a column of a two-column paper, inches.
 COLUMN = 3.4
 
@@ -69,6 +72,12 @@ class Palette:
 PALETTES = (Palette("paper", markers=False), Palette("colorblind", markers=True))
 
 
+@cache
+def letters() -> frozenset[int]:
+    """Numbers of the letters that the figures' font has."""
+    return frozenset(font_manager.get_font(font_manager.findfont(FONT)).get_charmap())
+
+
 def apply() -> None:
     """Sets fonts and lines for a column of a paper; fonts are embedded in PDF (type 42) and drawn as paths in SVG."""
     mpl.use("Agg")
@@ -76,7 +85,7 @@ def apply() -> None:
         context="paper",
         style="ticks",
         rc={
-            "font.family": "DejaVu Sans",
+            "font.family": FONT,
             "font.size": 7,
             "axes.labelsize": 7,
             "axes.titlesize": 7.5,
@@ -101,5 +110,7 @@ def apply() -> None:
             "ps.fonttype": 42,
             "svg.fonttype": "path",
             "svg.hashsalt": "acmr",
+            # Names hold dollar signs.
+            "text.parse_math": False,
         },
     )

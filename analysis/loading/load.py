@@ -5,7 +5,7 @@ Nothing that lies in the runs folder vanishes: what cannot be used is listed wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ import numpy as np
 import pandas as pd
 
 from acmr.cells import CELLS, Cell, planned_cells
+from acmr.names import distinct
 from acmr.records import ENDED
 from acmr.run_folders import run_folders
 from analysis.loading.identify import PAIRS
-from analysis.loading.read_run import DAMAGED, DUPLICATE, FOREIGN, SUPERSEDED, no_episodes, read_run
+from analysis.loading.read_run import DAMAGED, DUPLICATE, FOREIGN, SUPERSEDED, FoundRun, no_episodes, read_run
 
 #: States of runs that have come to their end, and so enter the comparisons. A run that diverged will never reach the
 #: threshold: leaving it out would favor settings that break.
@@ -33,7 +34,8 @@ class RunSet:
 
     Attributes:
         root: The runs folder.
-        runs: One row a run, indexed by its path below the root: ``group, cell, seed, profile, env, transfer, freeze``
+        runs: One row a run, indexed by its path below the root in visible letters: ``directory`` (that path as the
+            file system has it), ``group, cell, seed, profile, env, transfer, freeze``
             (see :class:`~analysis.loading.identify.Identity`), ``state`` and ``reason``, ``counted`` (enters
             comparisons), ``episodes`` (number), ``last_step`` (end of the last episode), ``horizon`` (step up to which
             the run is known not to have reached the threshold, if it has not), ``cut`` (ends at its own threshold, as
@@ -88,7 +90,7 @@ def load(root: Path) -> RunSet:
     if not root.is_dir():
         what = "is no folder" if root.exists() else "there is no such folder"
         raise InputError(f"{root}: {what}; give one with runs, as in runs/paper (python run.py matrix=paper makes it)")
-    found = {run.row["run"]: run for run in (read_run(root, folder) for folder in run_folders(root))}
+    found = _named([read_run(root, folder) for folder in run_folders(root)])
     runs = _runs_frame([run.row for run in found.values()])
     _one_profile(root, runs)
     _mark_duplicates(runs)
@@ -101,8 +103,18 @@ def load(root: Path) -> RunSet:
     )
 
 
+def _named(runs: list[FoundRun]) -> dict[str, FoundRun]:
+    """The runs by names of visible letters; names with bytes that are no text pandas would take for one another."""
+    names, groups = (distinct(run.row[key] for run in runs) for key in ("run", "group"))
+    rows = [
+        run.row | {"run": names[run.row["run"]], "group": groups[run.row["group"]], "directory": run.row["run"]}
+        for run in runs
+    ]
+    return {row["run"]: replace(run, row=row) for run, row in zip(runs, rows, strict=True)}
+
+
 _RUN_COLUMNS = (
-    *("run", "group", "cell", "seed", "profile", "env", "transfer", "freeze", "state", "reason"),
+    *("run", "directory", "group", "cell", "seed", "profile", "env", "transfer", "freeze", "state", "reason"),
     *("episodes", "last_step", "horizon", "cut"),
     *("total_timesteps", "stop_after", "learning_starts", "threshold", "consecutive"),
     *("wall_seconds", "steps_per_second", "steps_in_summary"),

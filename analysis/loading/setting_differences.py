@@ -34,12 +34,13 @@ def setting_differences(data: RunSet) -> tuple[pd.DataFrame, pd.DataFrame]:
     """
     groups = [group for group in data.groups if set(data.runs.index[data.runs["group"] == group]) & set(data.configs)]
     designed = (*DEFINING, *(key for cell in data.cells for key in cell.changes))
-    defining: list[dict[str, str]] = []
-    other: list[dict[str, str]] = []
+    defining: list[list[str]] = []
+    other: list[list[str]] = []
     for key, values in {**_settings(data), **_circumstances(data)}.items():
         if len(set(values.values())) < 2 or _is(key, SKIPPED):
             continue
-        row = {"setting": key} | {group: _of_group(data, group, values) for group in groups}
+        # As lists, for a group may be called "setting".
+        row = [key, *(_of_group(data, group, values) for group in groups)]
         (defining if _is(key, designed) else other).append(row)
     columns = ["setting", *groups]
     return pd.DataFrame(defining, columns=columns), pd.DataFrame(other, columns=columns)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import pandas as pd
+from markupsafe import Markup
 
+from acmr.names import link, terminal
 from acmr.records import CONFIG_FILE, EPISODE_FILES, LOG_FILE, SUMMARY_FILE
 from analysis.analyze import Analysis
 from analysis.loading.missing import matrix_command, profile_of
@@ -75,12 +77,13 @@ def data_uri(content: bytes, kind: str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def write_report(report: Report, out: Path) -> Path:
+def write_report(report: Report, folder: Path, out: Path) -> Path:
     """Writes ``report.html``.
 
     Args:
         report: What it shows.
-        out: Folder of the results; links to runs and tables are relative to it.
+        folder: Where it is written.
+        out: Where it will lie; links to runs and tables are relative to that.
 
     Returns:
         Its path.
@@ -91,8 +94,9 @@ def write_report(report: Report, out: Path) -> Path:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        # Whatever the page shows goes through here, then through the escaping of HTML.
+        finalize=_shown,
     )
-    environment.filters["words"] = heading
     numbers = report.analysis
     defining, differing = setting_differences(numbers.data)
     page = environment.get_template("report.html").render(
@@ -105,22 +109,27 @@ def write_report(report: Report, out: Path) -> Path:
         source=published_table3()["source"].iloc[0],
         detailed=_detailed(numbers.table3),
         notes=_notes,
-        defining=defining,
-        differing=differing,
+        defining=_table(defining, head=str),
+        differing=_table(differing, head=str),
         about_n=prose.about_n(numbers.table3, numbers.data.cells),
         caveats=prose.caveats(numbers.threshold, numbers.data.cells),
         how_runs_count=prose.how_runs_count(numbers.consecutive),
     )
-    path = out / "report.html"
+    path = folder / "report.html"
     path.write_text(page, encoding="utf-8")
     return path
 
 
-def _table(frame: pd.DataFrame, columns: Sequence[str] | None = None) -> Table:
+def _shown(value: object) -> object:
+    return terminal(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
+def _table(frame: pd.DataFrame, columns: Sequence[str] | None = None, head: Callable[[str], str] = heading) -> Table:
     shown = marked(frame) if columns is None else marked(frame)[list(columns)]
     text = readable(shown, missing="–")
-    numeric = [bool(pd.api.types.is_numeric_dtype(shown[name])) for name in shown.columns]
-    return Table([str(name) for name in shown.columns], text.to_numpy().tolist(), numeric)
+    # By place, for groups may have one name with another column.
+    numeric = [bool(pd.api.types.is_numeric_dtype(kind)) for kind in shown.dtypes]
+    return Table([head(str(name)) for name in shown.columns], text.to_numpy().tolist(), numeric)
 
 
 def _detailed(table3: pd.DataFrame) -> Table:
@@ -140,7 +149,7 @@ def _notes(comparisons: pd.DataFrame) -> list[str]:
 def _runs(analysis: Analysis, out: Path) -> list[dict[str, Any]]:
     rows = []
     for name, run in analysis.measured.iterrows():
-        directory = analysis.data.root / str(name)
+        directory = analysis.data.root / run["directory"]
         links = [(file, _relative(directory / file, out)) for file in RUN_FILES if (directory / file).is_file()]
         rows.append(
             {
@@ -168,4 +177,4 @@ def _known(value: float) -> float | None:
 
 
 def _relative(path: Path, out: Path) -> str:
-    return Path(os.path.relpath(path.resolve(), out.resolve())).as_posix()
+    return link(Path(os.path.relpath(path.resolve(), out.resolve())))

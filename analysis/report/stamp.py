@@ -24,15 +24,15 @@ def fingerprint(data: RunSet, out: Path, settings: dict[str, object]) -> str:
         settings: Options of the command line.
     """
     digest = hashlib.sha256(repr(sorted(settings.items())).encode())
-    digest.update(os.path.relpath(data.root.resolve(), out.resolve()).encode())
+    digest.update(os.fsencode(os.path.relpath(data.root.resolve(), out.resolve())))
     package, ground = Path(__file__).parent.parent, Path(cells.__file__).parent
     sources = sorted(path for path in package.rglob("*") if path.suffix in (".py", ".html", ".css", ".js", ".csv"))
-    runs = [data.root / str(run) / name for run in data.runs.index for name in (*RUN_FILES, STATUS_FILE)]
+    runs = [data.root / str(run) / name for run in data.runs["directory"] for name in (*RUN_FILES, STATUS_FILE)]
     places = {package: sources, ground: sorted(ground.glob("*.py")), data.root: runs}
     for base, path in [(base, path) for base, paths in places.items() for path in paths]:
         if path.is_file():
             content = hashlib.sha256(path.read_bytes()).hexdigest()
-            digest.update(f"{path.relative_to(base).as_posix()} {content}\n".encode())
+            digest.update(os.fsencode(f"{path.relative_to(base).as_posix()} {content}\n"))
     return digest.hexdigest()
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from acmr.names import csv_cell, latex, markdown
 from analysis.statistics.comparisons import PAPER_COLUMNS
 
 #: Columns of the table of runs for print; its CSV has more.
@@ -34,12 +35,14 @@ def write_table(table: pd.DataFrame, out: Path, name: str, caption: str, columns
         caption: LaTeX caption.
         columns: Those for Markdown and LaTeX; None: all.
     """
-    table.to_csv(out / f"{name}.csv", index=False, na_rep="NaN", lineterminator="\n")
+    texts = {str(column) for column in table.select_dtypes("object")}
+    plain = table.assign(**{column: table[column].map(_csv_value) for column in texts})
+    plain.to_csv(out / f"{name}.csv", index=False, na_rep="NaN", lineterminator="\n")
     shown = readable(marked(table) if columns is None else marked(table)[columns])
     alignment = ["left" if name in _text_columns(table) else "right" for name in shown.columns]
     shown.columns = pd.Index([heading(str(name)) for name in shown.columns])
-    markdown = shown.to_markdown(index=False, disable_numparse=True, colalign=alignment)
-    (out / f"{name}.md").write_text(markdown + "\n", encoding="utf-8")
+    text = shown.map(markdown).to_markdown(index=False, disable_numparse=True, colalign=alignment)
+    (out / f"{name}.md").write_text(text + "\n", encoding="utf-8")
     (out / f"{name}.tex").write_text(_latex(shown, alignment, name, caption), encoding="utf-8")
 
 
@@ -48,8 +51,8 @@ def _latex(shown: pd.DataFrame, alignment: list[str], name: str, caption: str) -
     sides, wide = [side[0] for side in alignment], len(shown.columns) > WIDE
     longest = [max(map(len, shown[column]), default=0) for column in shown.columns]
     widths = ["p{11em}" if length > SENTENCE else side for length, side in zip(longest, sides, strict=True)]
-    cells = shown.style.hide(axis="index").format(_with_minus, escape="latex")
-    escaped = cells.format_index(escape="latex", axis=1).to_latex(
+    cells = shown.style.hide(axis="index").format(_latex_cell)
+    escaped = cells.format_index(_latex_cell, axis=1).to_latex(
         hrules=True,
         caption=caption,
         environment="table*" if wide else "table",
@@ -63,8 +66,12 @@ def _latex(shown: pd.DataFrame, alignment: list[str], name: str, caption: str) -
     return (before.replace("\\centering\n", small) if wide else before) + " & ".join(stacks) + after
 
 
-def _with_minus(text: object) -> str:
-    return re.sub(r"^-(?=\d)", "$-$", str(text))
+def _latex_cell(text: object) -> str:
+    return re.sub(r"^-(?=\d)", "$-$", latex(str(text)))
+
+
+def _csv_value(value: object) -> object:
+    return csv_cell(value) if isinstance(value, str) else value
 
 
 def _stacked(words: str, side: str) -> str:
@@ -82,8 +89,9 @@ def marked(table: pd.DataFrame) -> pd.DataFrame:
 
 def readable(table: pd.DataFrame, missing: str = "NaN") -> pd.DataFrame:
     """The table as text: steps without decimals, the rest with three, NaN as ``missing``."""
-    text = {name: [_cell_text(str(name), value, missing) for value in table[name]] for name in table.columns}
-    return pd.DataFrame(text, columns=table.columns)
+    rows, names = table.itertuples(index=False, name=None), [str(name) for name in table.columns]
+    text = [[_cell_text(name, value, missing) for name, value in zip(names, row, strict=True)] for row in rows]
+    return pd.DataFrame(text, columns=table.columns, dtype=object)
 
 
 def paper_columns() -> list[str]:

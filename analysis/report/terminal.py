@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from acmr.names import terminal
 from acmr.text import UNLIMITED, shorten
 from analysis.loading.missing import Missing
 from analysis.loading.read_run import UNFINISHED
@@ -53,7 +54,7 @@ def print_summary(cells: pd.DataFrame, comparisons: pd.DataFrame, title: str, co
     for name, mark, *values in zip(names, marks, *columns.values(), strict=True):
         # As texts, because a name may hold what looks like rich's markup.
         table.add_row(*map(Text, (name + mark, *values)))
-    console.print(Text(title, style="bold"), soft_wrap=True)
+    console.print(Text(terminal(title), style="bold"), soft_wrap=True)
     console.print(table)
 
 
@@ -65,9 +66,13 @@ def _rows(cells: pd.DataFrame, comparisons: pd.DataFrame) -> list[dict[str, str]
         numbers |= {"mean": _steps(row["mean"]), "SD": _steps(row["std"])}
         test = tests.get(row["group"])
         if test and test["runs_reference"] and test["runs_index"]:
-            numbers |= {"against": test["reference"], "t": _decimal(test["t_score"]), "p": _decimal(test["p_value"])}
+            numbers |= {
+                "against": terminal(test["reference"]),
+                "t": _decimal(test["t_score"]),
+                "p": _decimal(test["p_value"]),
+            }
             numbers["log-rank p"] = _decimal(test["p_log_rank"])
-        rows.append({"cell": row["group"], "reached": f"{row['reached']} of {row['runs']}", **numbers})
+        rows.append({"cell": terminal(row["group"]), "reached": f"{row['reached']} of {row['runs']}", **numbers})
     return rows
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from acmr.names import archive_keys
 from analysis import FORMATS
 from analysis.analyze import Analysis
 from analysis.figures import stills
@@ -39,40 +41,36 @@ class Written:
     left_out: list[str] = field(default_factory=list)
 
 
-def write_results(analysis: Analysis, out: Path, options: argparse.Namespace, scratch: Path) -> Written:
+#: Files of an earlier analysis that go although this one may not make them again. Figures 2 and 3 are not among them:
+#: a machine without a GL library shall not take them away.
+REPLACED = (
+    *(f"{folder}{spec.name}.{kind}" for folder in ("", "colorblind/") for spec in FIGURES for kind in FORMATS),
+    *(f"comparisons.{kind}" for kind in ("csv", "md", "tex")),
+)
+
+
+def write_results(analysis: Analysis, folder: Path, out: Path, options: argparse.Namespace, scratch: Path) -> Written:
     """Writes all results.
 
     Args:
         analysis: The numbers.
-        out: Folder, made if need be.
+        folder: An empty folder, for the results.
+        out: Where they will lie; links in them are relative to it.
         options: ``format``, ``window`` and ``no_stills`` of the command line.
         scratch: Folder for files that are not kept.
     """
-    (out / "colorblind").mkdir(parents=True, exist_ok=True)
-    _clear(out)
+    (folder / "colorblind").mkdir()
     written = Written()
     # The pictures take seconds, in processes of their own: they are made while the rest is.
     rendering = [] if options.no_stills else stills.start(analysis.data.pair, scratch)
     try:
-        tables = _write_tables(analysis, out, written)
-        pictures = _write_figures(analysis, out, options, written)
-        pictures = _write_stills(rendering, out, options.format, written) + pictures
+        tables = _write_tables(analysis, folder, written)
+        pictures = _write_figures(analysis, folder, options, written)
+        pictures = _write_stills(rendering, folder, options.format, written) + pictures
     finally:
         stills.stop(rendering)
-    write_report(Report(analysis, tables, pictures, written.left_out), out)
+    write_report(Report(analysis, tables, pictures, written.left_out), folder, out)
     return written
-
-
-def _clear(out: Path) -> None:
-    """Removes what an earlier analysis may have left and this one need not make again.
-
-    Figures 2 and 3 stay: a machine without a GL library shall not take them away.
-    """
-    names = [f"{spec.name}.{kind}" for spec in FIGURES for kind in FORMATS]
-    for path in [folder / name for folder in (out, out / "colorblind") for name in names]:
-        path.unlink(missing_ok=True)
-    for kind in ("csv", "md", "tex"):
-        (out / f"comparisons.{kind}").unlink(missing_ok=True)
 
 
 def _write_tables(analysis: Analysis, out: Path, written: Written) -> dict[str, pd.DataFrame]:
@@ -90,10 +88,18 @@ def _write_tables(analysis: Analysis, out: Path, written: Written) -> dict[str, 
         plan["comparisons"] = (analysis.others, "Groups that are no cells.", paper_columns())
     for name, (table, caption, columns) in plan.items():
         write_table(table, out, name, caption, columns)
-    arrays: dict[str, Any] = scores(measured)
-    np.savez(out / "scores.npz", **arrays)
+    _write_arrays(scores(measured), out / "scores.npz")
     written.tables = len(plan)
     return {name: table for name, (table, _, _) in plan.items()}
+
+
+def _write_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
+    """Arrays by name, as ``numpy.load`` reads them; ``numpy.savez`` takes some names for arguments of its own."""
+    keys = archive_keys(arrays)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{keys[name]}.npy", "w") as file:
+                np.lib.format.write_array(file, array, allow_pickle=False)
 
 
 def _write_figures(analysis: Analysis, out: Path, options: argparse.Namespace, written: Written) -> list[Picture]:
