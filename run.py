@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from acmr.settings.run_spec import RunSpec
+
+#: Exit code of a run whose environment failed.
+ENDED_BY_ENVIRONMENT = 1
 
 # Hydra would print several lines and exit; with this it hands us the error, and the user gets one line.
 os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -66,9 +70,19 @@ def _train(cfg: DictConfig) -> None:
 
 
 def _train_job(path: Path) -> None:
+    from acmr.config import ConfigError
     from sweeps.job import adopt
 
-    _run(adopt(path))
+    try:
+        _run(adopt(path))
+    except ConfigError as error:
+        # Nobody watches a run of a sweep: its log keeps the way to where the code of its environment failed.
+        if error.exit_code == ENDED_BY_ENVIRONMENT:
+            origin: BaseException = error
+            while origin.__cause__ is not None:
+                origin = origin.__cause__
+            traceback.print_exception(origin, chain=False)
+        raise
 
 
 def _run(spec: RunSpec) -> None:

@@ -126,6 +126,9 @@ def _start(command: list[str], variables: dict[str, str], log: IO[bytes]) -> sub
 
 
 def _error_line(lines: list[str]) -> str:
+    # What is said last says most, also after the traceback of an environment.
+    if lines and lines[-1].startswith("error: "):
+        return lines[-1].removeprefix("error: ")
     traces = [number for number, line in enumerate(lines) if line.startswith("Traceback (most recent call last)")]
     if traces:
         return next((line for line in lines[traces[-1] + 1 :] if not line.startswith(" ")), lines[-1])

@@ -191,6 +191,8 @@ def test_a_run_that_raises_exits_or_is_killed_takes_no_other_with_it(out, tmp_pa
     ]
     ends = re.findall(r"^failed  (\S+) seed 1: (.+)\n  log: (\S+/output\.log)$", told.stdout, re.MULTILINE)
     assert len(ends) == 3, told.stdout
+    where = r"^failed .*failed at step 250: .*RuntimeError: .* \(broken.py:23, in step\)"
+    assert re.search(where, told.stdout, re.MULTILINE), told.stdout
     for reason in ("RuntimeError: the cart has no wheels", "exit code 9", "killed by SIGKILL"):
         (log,) = (log for name, why, log in ends if reason in why and name in log)
         assert Path(log).read_text().count("Traceback") == (retries + 1 if reason.startswith("RuntimeError") else 0)
