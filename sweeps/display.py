@@ -178,7 +178,8 @@ def _sentence(view: RunStatus, detail: str) -> str:
 
 def _remark(run: PlannedRun) -> str:
     if run.stands_for:
-        return f"  (in full, since it teaches: stands for {', '.join(run.stands_for)})"
+        why = "in full, and there" if run.ended else "in full, since it teaches"
+        return f"  ({why}: stands for {', '.join(run.stands_for)})"
     return "  (added: the teacher of runs below)" if run.implied else ""
 
 

@@ -101,7 +101,8 @@ def expand(jobs: Iterable[Sequence[str]]) -> list[RunSpec]:
 def make_plan(specs: Sequence[RunSpec]) -> Plan:
     """Adds the teachers that students imply, and finds out what is there already.
 
-    A run that stops at its threshold is not made where the full one, whose beginning it is, teaches another of them.
+    A run that stops at its threshold is not made where the full one, whose beginning it is, teaches another of them or
+    is there already.
 
     Args:
         specs: Runs in different directories.
@@ -143,18 +144,27 @@ def make_plan(specs: Sequence[RunSpec]) -> Plan:
 
 
 def _full_runs(specs: Sequence[RunSpec]) -> dict[Path, RunSpec]:
-    """For the directory of each run that stops: the full one, if that teaches a run of the sweep, trained or not.
+    """For the directory of each run that stops: the full one, if that teaches a run of the sweep or is complete.
 
     Students that are complete count, too: the same command means the same runs when it is typed again.
     """
     full = {
         spec.directory: specify(replace(spec.config, stop=HORIZON, stop_after=None))
         for spec in specs
-        if spec.config.stop == THRESHOLD and not spec.config.transfer.rules.needs_teacher
+        if spec.config.stop == THRESHOLD
     }
     students = [spec for spec in specs if full and spec.config.transfer.rules.needs_teacher]
     teaching = {teacher_spec(spec.config).directory for spec in students if spec.config.transfer.teacher is None}
-    return {directory: spec for directory, spec in full.items() if spec.directory in teaching}
+    return {place: spec for place, spec in full.items() if spec.directory in teaching or _is_there(spec)}
+
+
+def _is_there(spec: RunSpec) -> bool:
+    """Whether a run is complete, and not to be made anew."""
+    try:
+        return _ended(spec) == COMPLETE
+    except ConfigError:
+        # Its directory holds a run with other settings: none that could stand for this one.
+        return False
 
 
 def _teacher(config: ExperimentConfig) -> RunSpec | None:

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from safetensors.numpy import load_file
 
-from acmr.config import differing_keys
+from acmr.config import HORIZON, STOP_KEYS, differing_keys
 from acmr.settings.compose import compose_config, parse
 from analysis.analyze import analyze
 from analysis.loading.load import load
@@ -39,10 +39,13 @@ def test_they_are_analyzed_without_a_remark():
 @pytest.mark.parametrize("run", RUNS, ids=lambda run: f"{run.parent.name}-{run.name}")
 def test_each_is_the_papers_cell(run):
     summary = summary_of(run)
-    assert summary["global_step"] == summary["total_timesteps"] == 1_000_000
+    stops = {key: value for key, value in summary.items() if key in STOP_KEYS and value not in (None, HORIZON)}
+    end = (summary["steps_to_threshold"] or summary["stop_after"]) if stops else 1_000_000
+    assert (summary["global_step"], summary["total_timesteps"]) == (end, 1_000_000)
     assert summary["profile"] == "paper"
     assert not summary["git_commit"].endswith("-dirty")
-    meant = parse(compose_config([f"experiment={summary['cell']}", f"seed={summary['seed']}"]))
+    words = [f"{key}={value}" for key, value in stops.items()]
+    meant = parse(compose_config([f"experiment={summary['cell']}", f"seed={summary['seed']}", *words]))
     assert differing_keys(yaml.safe_load((run / "config.yaml").read_text()), meant) == []
     assert str(ROOT) not in "".join(path.read_text() for path in run.glob("*.[jy]*"))
 
@@ -85,6 +88,8 @@ def test_the_published_runs_are_taken_up_by_the_matrix(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "paper").symlink_to(PUBLISHED)
     command = [sys.executable, str(ROOT / "run.py"), "matrix=paper", "plan=true", f"output_dir={tmp_path / 'runs'}"]
+    # Full runs stand for those that stop.
+    command += ["stop=threshold", "stop_after=500000"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, env=dict(os.environ))
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
