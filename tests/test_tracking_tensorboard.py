@@ -76,7 +76,7 @@ def test_events_are_rebuilt_from_the_runs_own_files(tmp_path: Path) -> None:
     # Neither the analysis nor what is published takes them for results.
     runs = run.folder.parent.parent
     assert list(load(runs).runs.index) == [str(run.folder.relative_to(runs))]
-    ((published,), _) = publish(runs, tmp_path / "published")
+    (published,) = publish(runs, tmp_path / "published").added
     assert "tensorboard" not in {path.name for path in published.iterdir()}
 
 
