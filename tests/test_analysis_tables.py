@@ -215,7 +215,7 @@ def test_tables_1_and_2_are_the_papers(tmp_path):
 
 def test_table_files(tmp_path):
     table = analysis_of(tmp_path / "runs", PAPER_LIKE).table3
-    write_table(table, tmp_path, "table3", "A & B", paper_columns())
+    write_table(table, tmp_path, "table3", "A & B", paper_columns(table))
     with (tmp_path / "table3.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert [line["t_score"] for line in lines][3] == "NaN" == lines[3]["p_value"]

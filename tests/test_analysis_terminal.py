@@ -43,7 +43,16 @@ def test_in_a_pipe_nothing_is_cropped(columns: str, tmp_path: Path) -> None:
 
 def shown(width: int, groups: list[str], biased: bool = False) -> list[str]:
     cells = pd.DataFrame(
-        [{"group": group, "reached": 3, "runs": 3, "mean": 1234567.0, "std": 8.0, "biased": biased} for group in groups]
+        {
+            "group": group,
+            "reached": 3,
+            "runs": 3,
+            "mean": 1234567.0,
+            "std": 8.0,
+            "restricted_mean": 9.0,
+            "biased": biased,
+        }
+        for group in groups
     )
     tests = [
         {"index": group, "reference": groups[0], "runs_reference": 3, "runs_index": 3, "t_score": 1.0, "p_value": 0.5,

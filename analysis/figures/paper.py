@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from acmr.cells import CELLS, SOURCE, TARGET
-from analysis.figures import rows, steps
+from analysis.figures import rows, steps, survival
 from analysis.figures.data import Draw, FigureData, FigureSpec, mean_curve
 from analysis.figures.parts import count_label, mark_leaving, marker_style, short_steps, step_axis
 from analysis.figures.style import COLUMN, PALETTES, Palette
@@ -101,6 +101,7 @@ FIGURES = (
         f"Proof of concept: {' and '.join(_SOURCE)}. {_HOW}",
         _paper_figure(_SOURCE, dict(zip(_SOURCE, _FIRST_COLORS, strict=False))),
     ),
+    *survival.FIGURES,
     *steps.FIGURES,
     *rows.FIGURES,
 )

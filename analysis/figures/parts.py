@@ -77,14 +77,19 @@ def marker_style(palette: Palette, group: str, groups: Sequence[str]) -> dict[st
     return {"marker": palette.marker(group, groups), "markersize": 3.5, "markevery": POINTS // 8}
 
 
-def stacked(groups: list[str]) -> tuple[Figure, list[tuple[Axes, list[str]]]]:
-    """One panel for the target's cells, one for the source's, one for other groups, as far as they are there."""
+def panels(groups: list[str]) -> list[list[str]]:
+    """The target's cells, the source's, and other groups, as far as they are there: each set is drawn apart."""
     kinds = [
         [group for group in groups if group in CELLS and CELLS[group].role == TARGET],
         [group for group in groups if group in CELLS and CELLS[group].role == SOURCE],
         [group for group in groups if group not in CELLS][:MOST_OTHERS],
     ]
-    filled = [kind for kind in kinds if kind]
+    return [kind for kind in kinds if kind]
+
+
+def stacked(groups: list[str]) -> tuple[Figure, list[tuple[Axes, list[str]]]]:
+    """One panel for each of :func:`panels`."""
+    filled = panels(groups)
     figure, grid = plt.subplots(
         max(1, len(filled)),
         1,
@@ -97,13 +102,13 @@ def stacked(groups: list[str]) -> tuple[Figure, list[tuple[Axes, list[str]]]]:
     return figure, list(zip(grid.flat, filled, strict=False))
 
 
-def finish(figure: Figure, panels: list[tuple[Axes, list[str]]], data: FigureData) -> Figure | None:
+def finish(figure: Figure, drawn: list[tuple[Axes, list[str]]], data: FigureData) -> Figure | None:
     """Adds legends and the steps' axis to :func:`stacked` panels; None if there are no panels."""
-    if not panels:
+    if not drawn:
         plt.close(figure)
         return None
-    last = panels[-1][0]
-    for axes, groups in panels:
+    last = drawn[-1][0]
+    for axes, groups in drawn:
         longest = max(len(count_label(data, group)) for group in groups)
         if longest <= 8:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.03))

@@ -64,13 +64,17 @@ def differences(data: FigureData, palette: Palette) -> Figure | None:
             interval = (entry["difference_low"], entry["difference_high"])
             mean_bar(axes, row, entry["difference"], interval, color=color)
         else:
-            axes.plot(entry["restricted_difference"], row, "D", color="0.55", markersize=4.5, fillstyle="none")
+            ends = [entry[f"restricted_difference_{end}"] for end in ("low", "high")]
+            axes.plot(ends, [row, row], color="0.55", linewidth=1.1, linestyle=(0, (2, 1)), zorder=1)
+            middle = entry["restricted_difference"]
+            axes.plot(middle, row, "D", markersize=4.5, markerfacecolor="white", markeredgecolor="0.4")
     axes.axvline(0, color="black", linewidth=0.8)
     labels = [two_lines(f"{short_name(entry['index'])} − {short_name(entry['reference'])}") for entry in entries]
     axes.set_yticks(range(len(table)), labels)
     axes.set_ylim(len(table) - 0.5, -0.5)
     reach = 1.15 * float(np.nanmax(np.abs(table[["difference", "restricted_difference"]].to_numpy()))) or 1.0
-    widest = np.nanmax(np.abs(table[["difference_low", "difference_high", "restricted_difference"]].to_numpy()))
+    ends = ["difference_low", "difference_high", "restricted_difference_low", "restricted_difference_high"]
+    widest = np.nanmax(np.abs(table[[*ends, "restricted_difference"]].to_numpy()))
     reach = max(reach, 1.05 * float(min(widest, data.horizon)))
     axes.set_xlim(-reach, reach)
     axes.set_xlabel("difference in steps (← index faster, slower →)")
@@ -131,7 +135,7 @@ FIGURES = (
         "differences",
         "Difference to the reference",
         "Index less reference with the 95% t-interval of the difference; open gray diamonds: difference of the "
-        "restricted means, where a run never reached the threshold.",
+        "restricted means, where a run never reached the threshold, with its 95% interval (dashed).",
         differences,
     ),
     FigureSpec("transfer_metrics", "Initial, mean and asymptotic return", _TRANSFER, transfer_metrics, limited=True),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import matplotlib.pyplot as plt
-import numpy as np
 import seaborn as sns
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
@@ -13,29 +12,6 @@ from acmr.records import VELOCITY_COLUMN
 from analysis.figures.data import MOST_OTHERS, FigureData, FigureSpec, mean_curve
 from analysis.figures.parts import count_label, finish, mark_leaving, marker_style, stacked, step_axis, two_lines
 from analysis.figures.style import COLUMN, Palette
-from analysis.loading.read_run import UNFINISHED
-from analysis.statistics.survival import kaplan_meier
-
-
-def kaplan_meier_curves(data: FigureData, palette: Palette) -> Figure | None:
-    """Share of the runs not yet at the threshold, over the steps."""
-    figure, panels = stacked(data.present(data.groups))
-    for axes, groups in panels:
-        for group in groups:
-            # Unfinished runs are what censoring is made for: they were watched until their last episode.
-            own = data.runs[(data.runs["group"] == group) & (data.runs["episodes"] > 0)]
-            own = own[own["counted"] | (own["state"] == UNFINISHED)]
-            curve = kaplan_meier(own["time"], ~own["censored"].astype(bool))
-            color = palette.color(group, data.groups)
-            end = max(float(own["time"].max()), curve.steps[-1])
-            steps, share = np.append(curve.steps, end), np.append(curve.share, curve.share[-1])
-            style = {**marker_style(palette, group, data.groups), "markevery": 1} if palette.markers else {}
-            axes.step(steps, share, where="post", color=color, label=count_label(data, group), clip_on=False, **style)
-            at = curve.share[np.searchsorted(curve.steps, curve.censored, side="right") - 1]
-            if len(at):
-                axes.plot(curve.censored, at, "|", color=color, markersize=7, markeredgewidth=1.2, clip_on=False)
-        axes.set(ylim=(0, 1.05), ylabel="not yet at threshold")
-    return finish(figure, panels, data)
 
 
 def learning_bands(data: FigureData, palette: Palette) -> Figure | None:
@@ -111,14 +87,6 @@ def _over_steps(data: FigureData, palette: Palette, quantity: str, label: str) -
 _LEAVING = "open circles: where a seed's run ends and leaves the average"
 
 FIGURES = (
-    FigureSpec(
-        "kaplan_meier",
-        "Not yet at the threshold",
-        "Kaplan-Meier estimate of the share of runs that have not reached the threshold; ticks: runs that were watched "
-        "no longer.",
-        kaplan_meier_curves,
-        limited=True,
-    ),
     FigureSpec(
         "learning_curves",
         "Learning curves with bands",

@@ -21,7 +21,7 @@ from analysis.loading.setting_differences import setting_differences
 from analysis.loading.speed import METRICS_FILES
 from analysis.report import prose
 from analysis.report.published import published_table3
-from analysis.report.tables import heading, marked, readable
+from analysis.report.tables import footnote, heading, marked, readable
 
 #: Files of a run that are linked where they are there.
 RUN_FILES = (*EPISODE_FILES, *METRICS_FILES, CONFIG_FILE, SUMMARY_FILE, LOG_FILE)
@@ -97,6 +97,7 @@ def write_report(report: Report, folder: Path, out: Path) -> Path:
         # Whatever the page shows goes through here, then through the escaping of HTML.
         finalize=_shown,
     )
+    environment.filters["footnote"] = footnote
     numbers = report.analysis
     defining, differing = setting_differences(numbers.data)
     page = environment.get_template("report.html").render(
@@ -127,8 +128,9 @@ def _shown(value: object) -> object:
 def _table(frame: pd.DataFrame, columns: Sequence[str] | None = None, head: Callable[[str], str] = heading) -> Table:
     shown = marked(frame) if columns is None else marked(frame)[list(columns)]
     text = readable(shown, missing="–")
+    kinds = (frame if columns is None else frame[list(columns)]).dtypes
     # By place, for groups may have one name with another column.
-    numeric = [bool(pd.api.types.is_numeric_dtype(kind)) for kind in shown.dtypes]
+    numeric = [bool(pd.api.types.is_numeric_dtype(kind)) for kind in kinds]
     return Table([head(str(name)) for name in shown.columns], text.to_numpy().tolist(), numeric)
 
 

@@ -92,9 +92,10 @@ def how_runs_count(consecutive: int) -> list[str]:
         "described, marked and not tested.",
         "A run that diverged will never reach the threshold: it counts as not reached over its whole length (or with "
         "its steps to threshold, if it diverged later).",
-        "Where some runs of a cell never reached the threshold, its mean is of the others, and no t-test is made, "
-        "because dropping the slowest runs flatters a cell. Restricted means (steps within the horizon) and the "
-        "log-rank test keep every run; both p-values come from permutations.",
+        "Where some runs of a cell never reached the threshold, its mean is of the others and has a star, and no "
+        "t-test is made, because dropping the slowest runs flatters a cell. Restricted means (steps within the "
+        "horizon), the interval of their difference and the log-rank test keep every run; both p-values come from "
+        "permutations, and both are adjusted like those of the t-test.",
         f"Runs without {CONFIG_FILE} and {SUMMARY_FILE} (foreign) are taken as complete. Damaged and duplicate runs "
         "are listed and not used.",
     ]

