@@ -154,7 +154,8 @@ def test_what_is_typed_goes_on_as_the_runs_began(root):
     stop = f"stop=threshold stop_after={LIMIT}"
     assert lines["A2", 2] == f"python run.py experiment=A2 seed=2 {stop}"
     assert lines["A2", 3] == f"python run.py experiment=A2 seed=3 {stop}"
-    assert lines["A3", 1] == "python run.py experiment=A3 seed=1"
+    assert lines["A3", 1] == f"python run.py experiment=A3 seed=1 {stop}"
+    assert lines["H0", 1] == "python run.py experiment=H0 seed=1"  # students need the whole of it
     assert matrix_command(data) == f"python run.py matrix=paper experiment=H0,H1,A1,A2,A3,A4 seed=1,2,3 {stop}"
 
 

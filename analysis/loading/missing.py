@@ -44,14 +44,17 @@ def missing_runs(data: RunSet) -> list[Missing]:
     profile = profile_of(data)
     option = "" if profile == "paper" else f" profile={profile}"
     found = []
-    for cell in (cell.name for cell in data.cells):
+    for cell, teaches in ((cell.name, cell.teaches) for cell in data.cells):
+        own = runs[runs["cell"] == cell]
+        # Students need the whole of their teacher; any other cell that has no run yet ends as those of the folder do.
+        alike = own if len(own) or teaches else runs[runs["cell"].notna()]
         for seed in planned_seeds(runs):
-            there = runs[(runs["cell"] == cell) & (runs["seed"] == seed)]
+            there = own[own["seed"] == seed]
             if not there["counted"].any():
                 state = str(there["state"].iloc[0]) if len(there) else "missing"
                 force = " force=true" if state == DAMAGED else ""
                 # A run that is there goes on as it began; one that is not ends as the others of its cell do.
-                stop = stop_words(there if len(there) else runs[runs["cell"] == cell])
+                stop = stop_words(there if len(there) else alike)
                 line = f"python run.py experiment={cell} seed={seed}{option}{stop}{force}"
                 found.append(Missing(cell, seed, state, line))
     return found
