@@ -11,7 +11,7 @@ from acmr.cells import REFERENCE
 from acmr.records import SUMMARY_FILE
 from analysis.loading.load import InputError, RunSet
 from analysis.loading.missing import Missing, missing_runs, planned_seeds, profile_of
-from analysis.loading.read_run import SUPERSEDED
+from analysis.loading.read_run import DAMAGED, SUPERSEDED
 from analysis.statistics.comparisons import check_reference, compare_cells, compare_groups
 from analysis.statistics.early_ends import settle
 from analysis.statistics.metrics import measure
@@ -104,7 +104,7 @@ def analyze(
 
 
 def _common(data: RunSet, name: str, default: float) -> float:
-    values = sorted(set(data.runs[name].dropna()))
+    values = sorted(set(data.runs.loc[data.runs["state"] != DAMAGED, name].dropna()))
     if len(values) > 1:
         said = ", ".join(f"{value:g}" for value in values)
         raise InputError(f"{data.root}: the runs' own {name} differs ({said}); give one, as in --{name} {values[0]:g}")

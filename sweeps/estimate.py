@@ -13,9 +13,8 @@ from acmr.config import THRESHOLD, ExperimentConfig
 from acmr.envs import describe
 from acmr.records import COMPLETE, SUMMARY_FILE, ended_state
 from acmr.run_folders import run_folders
-from acmr.storage.json_files import read_json
 from sweeps.plan import Plan, PlannedRun
-from sweeps.view import Lengths
+from sweeps.view import Lengths, read_said
 
 #: Memory of a training beside its replay buffer: Python, torch and MuJoCo (measured, 64-bit Linux, CPU).
 _BASE_MEMORY = 450e6
@@ -77,7 +76,7 @@ def _finished(output_dir: Path) -> dict[Path, dict[str, Any]]:
     """Summaries of complete runs, by directory."""
     found: dict[Path, dict[str, Any]] = {}
     for folder in run_folders(output_dir.absolute()) if output_dir.is_dir() else ():
-        summary = read_json(folder.path / SUMMARY_FILE)
+        summary = read_said(folder.path / SUMMARY_FILE)
         if summary is not None and ended_state(summary) == COMPLETE:
             found[folder.path] = summary
     return found

@@ -16,6 +16,7 @@ from acmr.records import (
     FAILED,
     NO_EPISODE,
     RUNNING,
+    STATUS_FILE,
     STOPPED,
     SUMMARY_FILE,
     ended_state,
@@ -23,12 +24,17 @@ from acmr.records import (
 )
 from acmr.storage.json_files import read_json
 from acmr.storage.processes import is_alive
-from acmr.tracking.status_file import read_status
 from sweeps.folder import FINAL, WAITING, State, SweepRun
 
 #: A run that says it is running, but whose process is gone or has said nothing for so many seconds.
 LOST, SILENCE = "lost", 600.0
 BLOCKED = "blocked"
+#: What a run says in numbers, and what none of them reaches.
+_NUMBERS = (
+    *("global_step", "total_timesteps", "steps_per_second", "steps_to_threshold", "final_return", "latest_return"),
+    *("updated", "process"),
+)
+_MOST = 1e15
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,21 @@ class RunStatus:
         return (self.total - self.step) / self.speed if self.state == RUNNING and self.speed > 0 else None
 
 
+def read_said(path: Path) -> dict[str, Any] | None:
+    """What a run says in a JSON file, without numbers that nobody can compute with; other programs write any.
+
+    Returns:
+        None if the file is not there, not readable or no object.
+    """
+    content = read_json(path)
+    return content and {key: value for key, value in content.items() if key not in _NUMBERS or _is_usable(value)}
+
+
+def _is_usable(value: Any) -> bool:
+    # Of the comparisons with NaN none is true.
+    return isinstance(value, int | float) and abs(value) < _MOST
+
+
 def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State | None = None) -> RunStatus:
     """Looks at one run.
 
@@ -75,7 +96,7 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
         total: Steps that it takes, if that is known.
         state: What the sweep that it belongs to knows of it.
     """
-    summary = None if state and state.state == RUNNING else read_json(directory / SUMMARY_FILE)
+    summary = None if state and state.state == RUNNING else read_said(directory / SUMMARY_FILE)
     ended = None if summary is None else ended_state(summary)
     if summary is not None and ended is not None:
         step, speed = int(summary.get("global_step") or 0), float(summary.get("steps_per_second") or 0)
@@ -83,7 +104,7 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
         total = step if ended == COMPLETE else int(summary.get("total_timesteps") or total)
         reason = NO_EPISODE if summary.get("episodes") == 0 else ""
         return RunStatus(name, seed, directory, ended, step, total, speed, latest, reason, met)
-    status = read_status(directory) or {}
+    status = read_said(directory / STATUS_FILE) or {}
     alive = status.get("state") == RUNNING and _is_alive(status)
     told, reason = _told(status, state or State(STOPPED), alive)
     if summary is not None and not alive:

@@ -38,6 +38,6 @@ def read_json(path: Path) -> dict[str, Any] | None:
     """What a file says that others write; None if it is not there, not readable or no object."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return content if isinstance(content, dict) else None

@@ -10,11 +10,10 @@ import platform
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acmr.records import RUNNING, STATUS_FILE, STOPPED, EpisodeRecord
-from acmr.storage.json_files import read_json, replace_json
+from acmr.storage.json_files import replace_json
 from acmr.tracking.observer import Observer
 
 if TYPE_CHECKING:
@@ -75,8 +74,3 @@ class StatusFile(Observer):
         # Where that fails nobody can look at it; that is no reason to stop a training.
         with suppress(OSError):
             replace_json(self._path, content)
-
-
-def read_status(folder: Path) -> dict[str, Any] | None:
-    """What a run said last; None if it never did, or not readably."""
-    return read_json(folder / STATUS_FILE)

@@ -18,6 +18,8 @@ from analysis.loading.csv_table import Table, check_signs, read_table, to_number
 
 _KNOWN = (*EPISODE_COLUMNS, VELOCITY_COLUMN)
 _COUNTS = ("global_step", "episode_length")
+#: Sums and squares of larger returns may be no number any more.
+_MOST_RETURN = 1e100
 #: A header as our runs write it.
 _PLAIN_HEADER = re.compile(rb"\w+(,\w+)*\r?")
 
@@ -56,10 +58,11 @@ def read_episodes(path: Path, own: bool = False, ended: bool = False) -> tuple[p
     frame = pd.DataFrame({column: numbers[column] for column in _KNOWN})
     _check_order(path.name, frame, lines, own)
     returns = frame["episodic_return"].to_numpy()
-    odd = ~np.isfinite(returns)
+    # Of the comparisons with NaN none is true.
+    odd = ~(np.abs(returns) < _MOST_RETURN)
     if odd.any():
         frame["episodic_return"] = np.where(odd, np.nan, returns)
-        notes.append(f"{int(odd.sum())} returns are no finite number")
+        notes.append(f"{int(odd.sum())} returns are no finite number below {_MOST_RETURN:g}")
     return frame, notes
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from acmr.cells import CELLS, SOURCE, Cell, full_name, run_name
 from acmr.config import flatten
 from acmr.records import SEED_FOLDER
+from analysis.loading.values import MOST_SEED
 
 #: (source, target) environments of the profiles, for runs of which only the directory's name is left.
 PAIRS = (
@@ -63,11 +64,12 @@ def identify(directory: Path, name: str, config: Mapping[str, Any], summary: Map
     match = SEED_FOLDER.fullmatch(directory.name) or SEED_FOLDER.fullmatch(
         os.path.basename(os.path.realpath(directory))
     )
-    seed = summary.get("seed", settings.get("seed", int(match.group(1)) if match else None))
+    said = (summary.get("seed"), settings.get("seed"), int(match[1]) if match else None)
+    seed = next((value for value in said if isinstance(value, int) and not isinstance(value, bool)), None)
     return Identity(
         group=cell or name,
         cell=cell,
-        seed=seed if isinstance(seed, int) else None,
+        seed=seed if seed is not None and seed <= MOST_SEED else None,
         profile=_text(summary.get("profile", settings.get("profile"))),
         env=_text(env),
         transfer=_text(transfer),

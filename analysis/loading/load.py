@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from acmr.cells import CELLS, Cell, planned_cells
-from acmr.names import distinct
+from acmr.names import distinct, terminal
 from acmr.records import ENDED
 from acmr.run_folders import run_folders
 from analysis.loading.identify import PAIRS
@@ -71,7 +71,9 @@ class RunSet:
         for config in self.configs.values():
             pair = config.get("pair")
             if isinstance(pair, dict) and {"source", "target"} <= set(pair):
-                return str(pair["source"]), str(pair["target"])
+                # Both go into a command line.
+                source, target = (terminal(str(pair[role]))[:100] for role in ("source", "target"))
+                return source, target
         for pair in PAIRS:
             if set(pair) & set(self.runs["env"].dropna()):
                 return pair
@@ -134,7 +136,7 @@ def _runs_frame(rows: list[dict[str, Any]]) -> pd.DataFrame:
 
 
 def _one_profile(root: Path, runs: pd.DataFrame) -> None:
-    profiles = sorted(set(runs["profile"].dropna()))
+    profiles = sorted(set(runs.loc[runs["state"] != DAMAGED, "profile"].dropna()))
     if len(profiles) > 1:
         raise InputError(
             f"{root}: holds runs of the profiles {', '.join(profiles)}, which are no one experiment; "

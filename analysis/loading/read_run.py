@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import yaml
 
 from acmr.cells import stops
 from acmr.config import THRESHOLD
@@ -29,15 +28,15 @@ from acmr.records import (
     unended_reason,
 )
 from acmr.run_folders import RunFolder
+from acmr.text import LONGEST_MESSAGE
 from analysis.loading.episodes import read_episodes
 from analysis.loading.identify import Identity, identify
+from analysis.loading.values import MOST_STEPS, check_numbers, number, read_mapping
 
 #: States of a run that is there, beside those that it says itself.
 FOREIGN, UNFINISHED, UNKNOWN, DAMAGED, DUPLICATE = "foreign", "unfinished", "unknown", "damaged", "duplicate"
 #: A run that stopped at its threshold, of which there is a longer one.
 SUPERSEDED = "superseded"
-
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True)
@@ -67,10 +66,11 @@ def read_run(root: Path, folder: RunFolder) -> FoundRun:
     directory, problem = folder.path, folder.problem
     notes = [problem] if problem else []
     damaged = bool(problem)
-    config, summary, frame = {}, {}, no_episodes()
+    config, summary, frame = dict[str, Any](), dict[str, Any](), no_episodes()
+    left_out, more = list[str](), list[str]()
     try:
-        config = _mapping_of(directory / CONFIG_FILE)
-        summary = _mapping_of(directory / SUMMARY_FILE)
+        config, left_out = check_numbers(CONFIG_FILE, read_mapping(directory / CONFIG_FILE))
+        summary, more = check_numbers(SUMMARY_FILE, read_mapping(directory / SUMMARY_FILE))
         path = next((directory / name for name in EPISODE_FILES if (directory / name).is_file()), None)
         if path is not None:
             frame, said = read_episodes(path, own=bool(config), ended=bool(summary))
@@ -84,6 +84,7 @@ def read_run(root: Path, folder: RunFolder) -> FoundRun:
     parent = Path(name).parent.as_posix() if directory != root else directory.resolve().parent.name
     identity = identify(directory, parent if parent != "." else root.resolve().name, config, summary)
     state, reasons = (DAMAGED, []) if damaged else _state(directory, identity, frame, config, summary, notes)
+    reasons += [*left_out, *more]
     reasons += [f"also found as {other.relative_to(root).as_posix()}" for other in folder.others]
     row = {"run": name, **vars(identity), "state": state, "reason": "; ".join([*notes, *reasons])}
     row |= _measures(state, frame, config, summary) | _stop(name, frame, config, summary)
@@ -92,27 +93,6 @@ def read_run(root: Path, folder: RunFolder) -> FoundRun:
     elif state == UNFINISHED:
         row["horizon"] = max(row["horizon"], _steps_said(directory))
     return FoundRun(row, frame, config, summary)
-
-
-def _mapping_of(path: Path) -> dict[str, Any]:
-    """Contents of a YAML or JSON file; empty if there is no such file."""
-    if not path.is_file():
-        return {}
-    try:
-        text = path.read_text(encoding="utf-8")
-        value = json.loads(text) if path.suffix == ".json" else _yaml(text)
-    except (OSError, ValueError, yaml.YAMLError, RecursionError):
-        raise DamagedError(f"{path.name}: cannot be read") from None
-    if not isinstance(value, dict):
-        raise DamagedError(f"{path.name}: holds no settings")
-    return value
-
-
-def _yaml(text: str) -> Any:
-    # No run writes aliases; in a foreign file they can hold a mapping within itself, or a billion of them.
-    if "*" in text and any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, _LOADER)):
-        raise ValueError("aliases")
-    return yaml.load(text, _LOADER)
 
 
 def _state(
@@ -124,7 +104,7 @@ def _state(
     notes: list[str],
 ) -> tuple[str, list[str]]:
     if identity.seed is None:
-        return DAMAGED, ["its seed is not known: call its folder seed_<n>"]
+        return DAMAGED, ["its seed is not known: call its folder seed_<n>, n a whole number below 2^63"]
     if summary:
         return _ended_state(frame, summary, notes)
     if not config and len(frame):
@@ -144,18 +124,19 @@ def _ended_state(frame: pd.DataFrame, summary: dict[str, Any], notes: list[str])
         return UNFINISHED if unfinished else UNKNOWN, [unended_reason(summary)]
     reasons = []
     if summary.get("cause"):
-        reasons.append(f"at step {summary.get('step', '?')}: {summary['cause']}")
+        reasons.append(f"at step {summary.get('step', '?')}: {summary['cause']}"[:LONGEST_MESSAGE])
     if summary.get("inexact_resumes"):
-        reasons.append(f"resumed inexactly: {json.dumps(summary['inexact_resumes'])}")
+        reasons.append(f"resumed inexactly: {json.dumps(summary['inexact_resumes'])}"[:LONGEST_MESSAGE])
     if summary.get("physics_warnings"):
-        reasons.append(f"warnings of MuJoCo: {json.dumps(summary['physics_warnings'])}")
+        reasons.append(f"warnings of MuJoCo: {json.dumps(summary['physics_warnings'])}"[:LONGEST_MESSAGE])
     return state, reasons
 
 
 def _unfinished(directory: Path) -> str:
     try:
-        said = _mapping_of(directory / STATUS_FILE)
-        return f"no {SUMMARY_FILE}; {said['state']} at step {said['global_step']:,} of {said['total_timesteps']:,}"
+        said = read_mapping(directory / STATUS_FILE)
+        steps = f"{said['state']} at step {said['global_step']:,} of {said['total_timesteps']:,}"
+        return f"no {SUMMARY_FILE}; {steps[:LONGEST_MESSAGE]}"
     except (DamagedError, LookupError, TypeError, ValueError):
         return f"no {SUMMARY_FILE}"
 
@@ -164,8 +145,8 @@ def _measures(
     state: str, frame: pd.DataFrame, config: dict[str, Any], summary: dict[str, Any]
 ) -> dict[str, float | int | None]:
     last = int(frame["global_step"].iloc[-1]) if len(frame) else 0
-    total = _number(summary.get("total_timesteps", config.get("total_timesteps")))
-    reached = _number(summary.get("global_step"))
+    total = number(summary.get("total_timesteps", config.get("total_timesteps")))
+    reached = number(summary.get("global_step"))
     # What a run that diverged would have returned afterwards is known: nothing. It did not reach in all its time.
     ends = {COMPLETE: (reached, total), DIVERGED: (total, reached)}.get(state, ())
     agent = config.get("agent")
@@ -175,12 +156,12 @@ def _measures(
         "last_step": last,
         "horizon": max(last, int(next((end for end in ends if end is not None), last))),
         "total_timesteps": total,
-        "learning_starts": _number(starts),
-        "threshold": _number(summary.get("threshold", config.get("threshold"))),
-        "consecutive": _number(summary.get("consecutive", config.get("consecutive"))),
-        "wall_seconds": _number(summary.get("wall_seconds")),
-        "steps_per_second": _number(summary.get("steps_per_second")),
-        "steps_in_summary": _number(summary.get("steps_to_threshold")),
+        "learning_starts": number(starts),
+        "threshold": number(summary.get("threshold", config.get("threshold"))),
+        "consecutive": number(summary.get("consecutive", config.get("consecutive"))),
+        "wall_seconds": number(summary.get("wall_seconds")),
+        "steps_per_second": number(summary.get("steps_per_second")),
+        "steps_in_summary": number(summary.get("steps_to_threshold")),
     }
 
 
@@ -188,23 +169,19 @@ def _stop(name: str, frame: pd.DataFrame, config: dict[str, Any], summary: dict[
     """Whether a run ends at its own threshold before its last step, and when it does at the latest."""
     said = summary.get("stop", config.get("stop"))
     stopping = stops(name) if said is None else said == THRESHOLD
-    total = _number(summary.get("total_timesteps", config.get("total_timesteps")))
-    end = _number(summary.get("global_step")) or (frame["global_step"].iloc[-1] if len(frame) else 0)
-    after = _number(summary.get("stop_after", config.get("stop_after")))
+    total = number(summary.get("total_timesteps", config.get("total_timesteps")))
+    end = number(summary.get("global_step")) or (frame["global_step"].iloc[-1] if len(frame) else 0)
+    after = number(summary.get("stop_after", config.get("stop_after")))
     return {"cut": stopping and (total is None or end < total), "stop_after": after if stopping else None}
 
 
 def _steps_said(directory: Path) -> int:
     """Steps that a run under way says it has taken: without an episode's end among them, it has not reached by then."""
     try:
-        said = _mapping_of(directory / STATUS_FILE).get("global_step")
+        said = read_mapping(directory / STATUS_FILE).get("global_step")
     except DamagedError:
         return 0
-    return said if isinstance(said, int) and 0 < said < 2**53 else 0
-
-
-def _number(value: Any) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+    return said if isinstance(said, int) and 0 < said < MOST_STEPS else 0
 
 
 def no_episodes() -> pd.DataFrame:

@@ -64,7 +64,10 @@ def _circumstances(data: RunSet) -> dict[str, dict[str, str]]:
 
 
 def _text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, default=str)
+    try:
+        return value if isinstance(value, str) else json.dumps(value, default=str)
+    except TypeError:  # YAML takes dates and others for keys, JSON does not
+        return str(value)
 
 
 def _is(key: str, names: tuple[str, ...]) -> bool:
