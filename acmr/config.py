@@ -29,6 +29,9 @@ PROGRESS_MODES = ("auto", "bar", "lines", "off")
 PRECISIONS = ("float32", "bfloat16")
 EXACT, INEXACT = "exact", "inexact"
 ACTIVATIONS = ("relu", "none")
+#: What a sensor or an actuator that is gone counts as in the networks that knew it (``transfer=named``).
+MEAN, ZERO, INITIAL = "mean", "zero", "initial"
+IMPUTATIONS = (MEAN, ZERO, INITIAL)
 
 
 class ConfigError(ValueError):
@@ -114,6 +117,8 @@ class TransferRules:
     freezable: bool = True
     #: Hidden layers that the student needs at least.
     min_hidden_layers: int = 1
+    #: Whether it asks what the teacher saw and did on average.
+    statistics: bool = False
     #: Other methods, named to a user whom this one is refused.
     instead: list[str] = field(default_factory=list)
 
@@ -137,6 +142,12 @@ class TransferConfig:
     adapter_activation: str = "relu"
     #: Start from the teacher's temperature instead of log_alpha = 0.
     copy_log_alpha: bool = False
+    #: Sensors and actuators that the student calls otherwise than the teacher, each as ``old:new`` (``named`` only);
+    #: on the command line ``transfer.rename={old: new}``.
+    rename: list[str] = field(default_factory=list)
+    #: What those count as that the student has not (``named`` only): their mean under the teacher's policy, zero, or
+    #: their mean at the start of an episode.
+    impute: str = MEAN
     #: Free room for the settings of methods that are added.
     options: dict[str, Any] = field(default_factory=dict)
 

@@ -14,7 +14,8 @@ from hypothesis import settings
 
 from acmr.agent.architecture import Architecture, Dimensions
 from acmr.agent.networks import Networks
-from acmr.transfer.teacher import FORMAT_VERSION, Teacher, TeacherDescription, load_teacher, save_teacher
+from acmr.transfer.description import FORMAT_VERSION, TeacherDescription
+from acmr.transfer.teacher import Teacher, load_teacher, save_teacher
 
 torch.set_num_threads(1)
 # Tests that are started in the background inherit that Ctrl-C and hanging up are ignored; the programs under test would

@@ -15,7 +15,8 @@ from acmr.agent.architecture import Architecture, Dimensions
 from acmr.agent.networks import Networks
 from acmr.config import EnvConfig
 from acmr.envs import describe, make_env
-from acmr.transfer.teacher import FORMAT_VERSION, TeacherDescription, save_teacher
+from acmr.transfer.description import FORMAT_VERSION, TeacherDescription
+from acmr.transfer.teacher import save_teacher
 
 ANT = EnvConfig(
     name="ant_three_legs",

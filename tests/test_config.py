@@ -92,7 +92,7 @@ def test_python_defaults_say_what_the_files_of_the_paper_say():
         (["env.kwargs.a=1"], "env.kwargs.a: there is no such entry yet; type +env.kwargs.a=VALUE to add it"),
         (["env.kwargs={a:1}"], "env.kwargs: entries are added one by one; type +env.kwargs.NAME=VALUE"),
         (["+agent.foo=1"], "agent.foo: no such setting"),
-        (["transfer=hiden"], "must be one of direct, expand, hidden, none; did you mean transfer=hidden?"),
+        (["transfer=hiden"], "must be one of direct, expand, hidden, named, none; did you mean transfer=hidden?"),
         (["agent.precision=half"], "agent.precision=half: must be one of float32, bfloat16"),
         (["env=humanoyd"], "did you mean env=humanoid?"),
         (["experiment=A9"], "must be one of A0, A1, A2, A3, A4, H0, H1"),

@@ -158,3 +158,28 @@ def test_bad_arguments(run: Path, arguments: list[str], capsys: pytest.CaptureFi
         main([str(run), *arguments])
     assert stopped.value.code == 2
     assert arguments[1] in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_other_bodies_are_played_in_before_any_learning(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What fits of a policy for three legs, in a body with four, in its own, and where nothing fits."""
+    arguments = [str(run), "--env", "ant,ant_three_legs", "--episodes", "1", "--impute", "zero"]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "ant: 23 of 23 sensors kept, 0 gone, 4 added; 6 of 6 actuators kept, 0 gone, 2 added" in said
+    assert said.splitlines()[-3].split()[:2] == ["body", "mean"]
+    found = {name: json.loads((run / f"evaluation-{name}.json").read_text()) for name in ("ant", "ant_three_legs")}
+    assert (found["ant"]["environment"], found["ant"]["impute"]) == ("ant", "zero")
+    # The named environment, not the run's own, whose episodes end after 12 steps.
+    assert found["ant_three_legs"]["each"][0]["episode_length"] > 12
+    assert main([str(run), "--env", "Pendulum-v1", "--impute", "zero"]) == 2
+    assert "no sensor of the same name" in capsys.readouterr().err
+    assert not (run / "evaluation-Pendulum-v1.json").exists()
+
+
+@pytest.mark.parametrize(
+    "wrong", [["--env", "ant,"], ["--env", "ant,humanoid", "--out", "x.json"], ["--impute", "zero"]]
+)
+def test_bodies_that_make_no_sense_are_refused(run: Path, wrong: list[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([str(run), *wrong])
+    assert stop.value.code == 2

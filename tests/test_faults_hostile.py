@@ -58,7 +58,7 @@ def edit(folder: Path, **entries: object) -> None:
         {"adapter_activation": "__import__('os').system"},
         {"config": "rm"},
         {"seed": "1"},
-        {"format_version": 2},
+        {"format_version": 3},
         {"sha256": 7},
     ],
     ids=str,

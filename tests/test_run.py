@@ -189,5 +189,5 @@ def test_the_real_humanoid_and_its_armless_student(tmp_path):
 
 def test_help_lists_groups_and_settings():
     said = run("--help").stdout
-    for word in ("transfer: direct, expand, hidden, none", "total_timesteps: 1000000", "experiment=A2 seed=3"):
+    for word in ("transfer: direct, expand, hidden, named, none", "total_timesteps: 1000000", "experiment=A2 seed=3"):
         assert word in said

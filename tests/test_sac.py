@@ -12,7 +12,7 @@ from acmr.agent.networks import Networks
 from acmr.agent.replay_buffer import Batch
 from acmr.agent.sac import SAC
 from acmr.config import SACConfig, TransferConfig
-from acmr.transfer.methods import transfer
+from acmr.transfer.methods import Student, transfer
 
 DIMS, TEACHER_DIMS = Dimensions(6, 2), Dimensions(9, 4)
 LOW, HIGH = np.full(2, -0.5, np.float32), np.full(2, 1.5, np.float32)
@@ -111,7 +111,8 @@ def test_first_update_equals_the_formulas():
 def student(method: str, freeze: bool, teacher_factory) -> tuple[Networks, list[str]]:
     dims = DIMS if method == "direct" else TEACHER_DIMS
     teacher = None if method == "none" else teacher_factory(dims, (16, 12))
-    networks, report = transfer(fresh(5), teacher, TransferConfig(name=method), freeze, generator(6))
+    taker = Student(fresh(5), [], [])
+    networks, report = transfer(taker, teacher, TransferConfig(name=method), freeze, generator(6))
     return networks, report.frozen
 
 

@@ -14,7 +14,7 @@ from acmr.agent.replay_buffer import Batch
 from acmr.agent.sac import SAC
 from acmr.agent.sac_plain import PlainSAC
 from acmr.config import SACConfig, TransferConfig
-from acmr.transfer.methods import transfer
+from acmr.transfer.methods import Student, transfer
 
 SOURCE, TARGET = Dimensions(45, 9), Dimensions(31, 7)
 UPDATES = 200
@@ -71,7 +71,7 @@ def make_networks(cell: str, sizes: tuple[int, ...], teacher_factory: Callable, 
     fresh = Networks(Architecture.plain(dims, sizes, -high, high), generator(5))
     teacher = None if method == "none" else teacher_factory(SOURCE, sizes)
     config = TransferConfig(name=method, adapter_activation=activation)
-    networks, _ = transfer(fresh, teacher, config, freeze, generator(6))
+    networks, _ = transfer(Student(fresh, [], []), teacher, config, freeze, generator(6))
     return networks
 
 

@@ -17,7 +17,7 @@ from acmr.config import ConfigError, TransferConfig, TransferRules, differing_ke
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.run_spec import specify
 from acmr.transfer import methods
-from acmr.transfer.methods import METHODS, method, transfer
+from acmr.transfer.methods import METHODS, Student, Taken, method, transfer
 from acmr.transfer.teacher import load_teacher
 
 SOURCE, TARGET = Dimensions(12, 5), Dimensions(8, 3)
@@ -48,7 +48,12 @@ def settings(name: str) -> TransferConfig:
 
 def run(dims, teacher, name, freeze=False, sizes=SIZES, **options):
     config = replace(settings(name), **options)
-    return transfer(student(dims, sizes), teacher, config, freeze, torch.Generator().manual_seed(2))
+    taker = Student(
+        student(dims, sizes),
+        [f"obs/{row}" for row in range(dims.observation)],
+        [f"action/{row}" for row in range(dims.action)],
+    )
+    return transfer(taker, teacher, config, freeze, torch.Generator().manual_seed(2))
 
 
 @pytest.mark.parametrize(
@@ -122,7 +127,9 @@ def test_unknown_method_is_refused(teacher_factory):
 
 
 def test_a_method_may_take_other_widths_and_another_body_if_its_rules_do_not_forbid_it(teacher_factory, monkeypatch):
-    monkeypatch.setattr(methods.METHODS, "_entries", {"biases": lambda networks, *_: (networks, ["actor.mean"])})
+    monkeypatch.setattr(
+        methods.METHODS, "_entries", {"biases": lambda student, *_: Taken(student.networks, ["actor.mean"])}
+    )
     teacher, free = teacher_factory(SOURCE, (10, 8)), TransferRules(same_widths=False)
     assert run(TARGET, teacher, "biases", rules=free)[1].copied == ["actor.mean"]
     for broken in (TransferRules(), TransferRules(same_widths=False, same_body=True)):
@@ -183,18 +190,21 @@ def test_published_teachers_are_read_and_described_as_they_were():
 
 
 def test_every_method_has_a_yaml_file_and_the_other_way_round():
-    assert sorted(path.stem for path in (CONFIG_FOLDER / "transfer").glob("*.yaml")) == sorted(METHODS.names)
+    files = sorted(path.stem for path in (CONFIG_FOLDER / "transfer").glob("*.yaml"))
+    assert all(METHODS.find(name) for name in files)
+    assert files == sorted(METHODS.names)
 
 
 def test_a_new_method_is_one_function(teacher_factory, monkeypatch):
     monkeypatch.setattr(methods.METHODS, "_entries", dict(methods.METHODS._entries))
 
     @method("heads")
-    def heads(networks, teacher, config, generator):
+    def heads(student, teacher, config, generator):
+        networks = student.networks
         with torch.no_grad():
             networks.critic_1.output.weight.copy_(teacher.tensors["critic_1.output.weight"])
             networks.critic_1.output.bias.copy_(teacher.tensors["critic_1.output.bias"])
-        return networks, ["critic_1.output"]
+        return Taken(networks, ["critic_1.output"])
 
     networks, report = run(TARGET, teacher_factory(SOURCE, SIZES), "heads", freeze=True)
     assert report.copied == report.frozen == ["critic_1.output"]
@@ -203,6 +213,6 @@ def test_a_new_method_is_one_function(teacher_factory, monkeypatch):
 
 def test_the_guide_to_a_method_of_ones_own(tmp_path):
     said = follow(ROOT / "docs" / "howto-transfer.md", copy_checkout(tmp_path / "checkout"))
-    report = json.loads(said[said.index("{") :])
+    report, _ = json.JSONDecoder().raw_decode(said[said.index("{") :])
     assert report["copied"] == report["frozen"] == ["critic_1.output", "critic_2.output"]
     assert "  copied: 130 parameters: critic_1.output, critic_2.output" in said

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 
-from acmr.config import ConfigError
+from acmr.config import IMPUTATIONS, MEAN, ConfigError
 from acmr.evaluation.camera import without_gl
 from acmr.evaluation.evaluate import evaluate, still
 from acmr.evaluation.video import FILM_SUFFIXES
@@ -55,6 +55,15 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR", help="as in runs/quick/ant-none/seed_1")
     parser.add_argument("--episodes", type=_positive, default=10, help="default: 10")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode; the next ones count up")
+    parser.add_argument(
+        "--env",
+        type=_names,
+        metavar="ENV[,ENV...]",
+        help="play in other bodies, before any learning: what fits of the policy by the names of sensors and actuators",
+    )
+    parser.add_argument(
+        "--impute", choices=IMPUTATIONS, default=MEAN, help="what is gone in another body counts as; default: mean"
+    )
     parser.add_argument("--stochastic", action="store_true", help="sample actions, as in training")
     parser.add_argument(
         "--video", type=_film, metavar="FILE.mp4", help="film the first episode; or .gif (0.2 s a frame without a GPU)"
@@ -70,6 +79,11 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         parser.error(f"--seed {given.seed}: an integer of at least 0 is needed")
     if given.seed + given.episodes - 1 > MOST_SEED:
         parser.error(f"--seed {given.seed} --episodes {given.episodes}: seeds of at most {MOST_SEED} are needed")
+    if given.env is None and given.impute != MEAN:
+        parser.error(f"--impute {given.impute}: nothing is gone in the policy's own body; type --env ENV as well")
+    for option in ("video", "out"):
+        if given.env is not None and len(given.env) > 1 and getattr(given, option) is not None:
+            parser.error(f"--env {','.join(given.env)}: one file cannot hold several bodies; leave --{option} out")
     if given.seconds is not None and given.video is None:
         parser.error(f"--seconds {given.seconds:g}: there is no film; type --video FILE.mp4 as well")
     return given
@@ -78,6 +92,13 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
 def _add_size(parser: argparse.ArgumentParser) -> None:
     for name in ("--width", "--height"):
         parser.add_argument(name, type=_pixels, default=480, metavar="PIXELS", help="of the picture; default: 480")
+
+
+def _names(text: str) -> list[str]:
+    names = text.split(",")
+    if not all(names):
+        raise argparse.ArgumentTypeError(f"{text}: environments are needed, as in armless_humanoid,humanoid")
+    return list(dict.fromkeys(names))
 
 
 def _positive(text: str) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,9 +13,11 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 
+from acmr.agent.networks import Actor
 from acmr.config import ConfigError, EnvConfig
 from acmr.evaluation.camera import is_robot, make_camera
 from acmr.evaluation.rollout import MOST_STEPS, Episode, VideoOptions, play, render_mode
+from acmr.evaluation.zero_shot import policy_in
 from acmr.records import CONFIG_FILE, EVALUATION_FILE
 from acmr.settings.compose import environment_config
 from acmr.storage.durable import WriteError
@@ -100,16 +103,49 @@ def report(episodes: Sequence[Episode], **about: Any) -> dict[str, Any]:
 
 
 def evaluate(given: argparse.Namespace) -> None:
-    """Evaluates a run, prints each episode and writes the result as JSON."""
-    teacher, config = load_run(given.run_dir)
-    remark = check_fit(teacher, config)
-    if remark:
-        print(f"warning: {remark}", file=sys.stderr)
+    """Evaluates a run, prints each episode and writes the result as JSON; in each body that is asked for."""
+    teacher, own = load_run(given.run_dir)
+    contents = []
+    for name in given.env or [None]:
+        config = own if name is None else environment_config(name)
+        remark, actor = _policy(teacher, config, given, is_own=name is None)
+        contents.append(_evaluate_in(config, actor, remark, teacher, given))
+        _store(contents[-1], given.out or given.run_dir / _file_name(config, is_own=name is None))
+    if len(contents) > 1:
+        width = max(len(content["environment"]) for content in contents)
+        print(f"{'body':<{width}}  {'mean':>10}  {'least':>10}  {'most':>10}  {'length':>7}")
+        for content in contents:
+            numbers = [f"{content[f'{key}_return']:>10,.1f}" for key in ("mean", "min", "max")]
+            print(f"{content['environment']:<{width}}  {'  '.join(numbers)}  {content['mean_length']:>7,.0f}")
+
+
+def _policy(
+    teacher: Teacher, config: EnvConfig, given: argparse.Namespace, *, is_own: bool
+) -> tuple[str | None, Actor]:
+    """A remark on the body, if there is one, and the policy in it."""
+    if is_own:
+        remark = check_fit(teacher, config)
+        if remark:
+            print(f"warning: {remark}", file=sys.stderr)
+        return remark, teacher.build_networks().actor.eval()
+    actor, lines = policy_in(teacher, config, given.impute)
+    print(f"{config.name}: {'; '.join(lines)}")
+    return None, actor
+
+
+def _file_name(config: EnvConfig, *, is_own: bool) -> str:
+    path = Path(EVALUATION_FILE)
+    return EVALUATION_FILE if is_own else f"{path.stem}-{re.sub(r'[^A-Za-z0-9_.-]', '_', config.name)}{path.suffix}"
+
+
+def _evaluate_in(
+    config: EnvConfig, actor: Actor, remark: str | None, teacher: Teacher, given: argparse.Namespace
+) -> dict[str, Any]:
+    """Plays, prints each episode, and returns the content of the file."""
     if limit(config) is None:
         print(
             f"warning: {config.name} has no time limit: an episode is cut off at {MOST_STEPS:,} steps", file=sys.stderr
         )
-    actor = teacher.build_networks().actor.eval()
     episodes = []
     video = VideoOptions(given.video, given.seconds, given.width, given.height) if given.video else None
     for episode in play(
@@ -131,13 +167,17 @@ def evaluate(given: argparse.Namespace) -> None:
         sha256=teacher.description.sha256,
         precision=teacher.description.precision,
         same_robot=remark is None,
+        **({} if given.env is None else {"impute": given.impute}),
     )
     print(
         f"mean {content['mean_return']:,.1f}  standard deviation {content['std_return']:,.1f}"
         f"{_velocity(content['mean_forward_velocity'])}  over {len(episodes)} episodes, {content['policy']} policy"
         f"  ({content['fall_rate']:.0%} ended before their time limit)"
     )
-    path = given.out or given.run_dir / EVALUATION_FILE
+    return content
+
+
+def _store(content: dict[str, Any], path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, content)

@@ -133,7 +133,7 @@ class Session:
             state.clock.start()
             summary = self._summary(checkpoints, state, _train(trainer))
             if summary["status"] != DIVERGED:
-                description = describe_teacher(spec, self.prepared.about, trainer.agent, summary)
+                description = describe_teacher(spec, self.prepared.about, trainer.agent, summary, self.say)
                 save_teacher(run_dir.path, trainer.agent.networks, description)
             # Every row is on the disk before anything says that the run is finished, and a run with a summary is.
             state.logs.sync()

@@ -12,16 +12,15 @@ from acmr.agent.learner import Learner, find_learner
 from acmr.agent.memory import check_memory
 from acmr.agent.networks import Networks
 from acmr.agent.precision import MatmulPrecision, choose_products
-from acmr.config import ConfigError, ExperimentConfig
+from acmr.config import ConfigError
 from acmr.envs import EnvDescription, check_resume, describe
 from acmr.envs.state import ResumeCheck
 from acmr.run.random_streams import RandomStreams, random_streams
-from acmr.settings.run_spec import RunSpec, teacher_spec
-from acmr.storage.run_dir import RunDir
+from acmr.settings.run_spec import RunSpec
 from acmr.tracking.watchers import tracker_class
-from acmr.transfer.methods import check_body, transfer
+from acmr.transfer.find import find_teacher
+from acmr.transfer.methods import Student, transfer
 from acmr.transfer.report import TransferReport
-from acmr.transfer.teacher import Teacher, load_teacher
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,8 @@ def prepare(spec: RunSpec) -> Prepared:
     architecture = Architecture(dims, tuple(config.agent.hidden_sizes), about.action_low, about.action_high)
     check_memory(config, architecture)
     fresh = Networks(architecture, streams.networks)
-    networks, report = transfer(fresh, teacher, config.transfer, config.freeze, streams.networks)
+    student = Student(fresh, about.observation_names, about.action_names)
+    networks, report = transfer(student, teacher, config.transfer, config.freeze, streams.networks)
     copied_alpha = teacher is not None and config.transfer.copy_log_alpha
     log_alpha = teacher.description.log_alpha if teacher is not None and copied_alpha else 0.0
     return Prepared(
@@ -84,31 +84,6 @@ def prepare(spec: RunSpec) -> Prepared:
         products=choose_products(config.agent, config.device),
         resume_check=resume_check,
     )
-
-
-def find_teacher(config: ExperimentConfig, dims: Dimensions) -> Teacher | None:
-    """Loads the teacher that the settings name or imply.
-
-    Raises:
-        ConfigError: If there is none, with the command that trains it.
-    """
-    if not config.transfer.rules.needs_teacher:
-        return None
-    if config.transfer.teacher is not None:
-        return load_teacher(config.transfer.teacher)
-    source = teacher_spec(config)
-    if config.transfer.rules.same_body:
-        # Before anybody trains a teacher for days that will be of no use.
-        about = describe(source.config.env)
-        theirs = Dimensions(len(about.observation_names), len(about.action_names))
-        check_body(config.transfer, f"the source environment {source.config.env.name}", theirs, dims)
-    if not RunDir(source.directory).is_complete():
-        state = "is not finished" if RunDir(source.directory).stored_settings() else "does not exist"
-        raise ConfigError(
-            f"transfer={config.transfer.name}: the teacher's run {source.directory} {state}; "
-            f"train it with: {source.command} (or give another one: transfer.teacher=PATH)"
-        )
-    return load_teacher(source.directory)
 
 
 def _check_device(device: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,9 @@ from acmr.records import COMPLETE, DIVERGED, NO_EPISODE, EpisodeRecord, steps_to
 from acmr.run.reproducibility import git_commit, machine, versions
 from acmr.run.trainer import DivergedError
 from acmr.settings.run_spec import RunSpec
-from acmr.transfer.teacher import FORMAT_VERSION, TeacherDescription
+from acmr.text import one_line
+from acmr.transfer.description import FORMAT_VERSION, PolicyStatistics, TeacherDescription
+from acmr.transfer.statistics import measure_policy
 
 #: Episodes that the final return is the mean of.
 FINAL_EPISODES = 10
@@ -67,7 +69,7 @@ def summarize(
 
 
 def describe_teacher(
-    spec: RunSpec, about: EnvDescription, agent: Learner, summary: Mapping[str, Any]
+    spec: RunSpec, about: EnvDescription, agent: Learner, summary: Mapping[str, Any], say: Callable[[str], None]
 ) -> TeacherDescription:
     """What the file of the final networks says of them.
 
@@ -76,6 +78,7 @@ def describe_teacher(
         about: Its environment.
         agent: The learner at the end.
         summary: The content of ``summary.json``.
+        say: Where a line goes if the policy cannot be played.
     """
     made = agent.networks.architecture
     return TeacherDescription(
@@ -96,7 +99,18 @@ def describe_teacher(
         global_step=summary["global_step"],
         final_return=summary["final_return"],
         config=json.loads(json.dumps(spec.settings)),
+        statistics=_statistics(spec, agent, say),
     )
+
+
+def _statistics(spec: RunSpec, agent: Learner, say: Callable[[str], None]) -> PolicyStatistics | None:
+    """What the final policy sees and does."""
+    try:
+        return measure_policy(agent.networks.actor, spec.config.env)
+    except Exception as error:
+        # Whatever an environment does once more: the run is finished, and only its students would ask for this.
+        say(f"warning: the final policy could not be played ({one_line(error)}); its students cannot be told means")
+        return None
 
 
 def reached(summary: Mapping[str, Any]) -> str:

@@ -20,6 +20,8 @@ from acmr.settings.sources import SWEEPS, Sources
 SWEEP_WORDS = {word: f"hydra.sweeper.{word}" for word in ("plan", "retries", "workers")}
 #: Further folders of settings files.
 SEARCH_PATH = "hydra.searchpath"
+#: Names that the student has for what the teacher calls otherwise.
+RENAME = "transfer.rename"
 #: What Hydra reads as another thing than a name.
 _NO_NAME = re.compile(r"null|true|false|[-+]?[0-9.]+", re.IGNORECASE)
 
@@ -47,6 +49,8 @@ def _in_hydras_words(argument: str) -> str:
         return f"{SWEEP_WORDS[key]}{equal}{value}"
     if key.lstrip("+") in PATH_KEYS:
         return _quoted(key, value)
+    if key.lstrip("+") == RENAME and value.startswith("{"):
+        return _renamed(argument)
     if _is_search_path(argument):
         # Added to the places that the project needs, where Hydra would put others in their place.
         return f"{SEARCH_PATH}={as_override([*dict.fromkeys([*_searched(argument), SWEEPS])])}"
@@ -65,6 +69,16 @@ def _quoted(key: str, value: str) -> str:
         # An equal sign, as in names of runs, or a letter that is not English.
         return f"{key}={as_override(value)}"
     return argument
+
+
+def _renamed(argument: str) -> str:
+    """``transfer.rename={old: new}`` as the list that the setting is, for Hydra adds no entries to a typed mapping."""
+    try:
+        pairs = OverridesParser.create().parse_overrides([argument])[0].value()
+    except OverrideParseException as error:
+        raise ConfigError(f"{argument}: names are given as in '{RENAME}={{old: new}}'") from error
+    assert isinstance(pairs, dict)
+    return f"{RENAME}={as_override([f'{old}:{new}' for old, new in pairs.items()])}"
 
 
 def _is_search_path(argument: str) -> bool:

@@ -8,6 +8,7 @@ from acmr.config import (
     ACTIVATIONS,
     EXACT,
     HORIZON,
+    IMPUTATIONS,
     INEXACT,
     PRECISIONS,
     PROGRESS_MODES,
@@ -59,6 +60,7 @@ def validate(config: ExperimentConfig) -> None:
     _one_of("progress", config.progress, PROGRESS_MODES)
     _one_of("resume", config.resume, (EXACT, INEXACT))
     _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
+    _one_of("transfer.impute", config.transfer.impute, IMPUTATIONS)
     if config.tracking.base_url == "":
         raise ConfigError("tracking=self_hosted needs the server's address: type tracking.base_url=http://HOST:PORT")
     _check_transfer(config)

@@ -1,13 +1,14 @@
 """Actor-Critic Model Reuse: what a student takes from its teacher, layer by layer (paper, section 3.2).
 
-A method is one function: it takes the student's fresh networks and the teacher, and returns the networks to learn
-with and the names of the layers that came from the teacher. One of your own is a module of its name in this package
-and a YAML file in ``conf/transfer``, with the rules that teacher and student must keep (docs/howto-transfer.md).
+A method is one function: it takes the student with its fresh networks and the teacher, and returns the networks to
+learn with and which layers came from the teacher. One of your own is a module of its name in this package and a YAML
+file in ``conf/transfer``, with the rules that teacher and student must keep (docs/howto-transfer.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -19,16 +20,50 @@ from acmr.registry import Registry
 from acmr.transfer.report import TransferReport, report_transfer
 from acmr.transfer.teacher import Teacher
 
-#: Student, teacher (None where the method's rules say that it needs none), settings, source of new weights; returns
-#: the networks to learn with and the names of the layers that hold the teacher's values.
-Method = Callable[[Networks, Any, TransferConfig, torch.Generator], tuple[Networks, list[str]]]
+
+@dataclass(frozen=True)
+class Student:
+    """Who is to learn.
+
+    Attributes:
+        networks: Fresh ones, in the dimensions of its environment.
+        observation_names: One per observation.
+        action_names: One per action.
+    """
+
+    networks: Networks
+    observation_names: Sequence[str]
+    action_names: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What a method made of a student.
+
+    Attributes:
+        networks: Those to learn with: the student's own, or new ones.
+        copied: Names of the layers that hold the teacher's values as they are; ``freeze=true`` freezes them.
+        fitted: Names of the layers that hold the teacher's values as far as they fit; they always learn.
+        details: What else there is to say in ``transfer.json``.
+        lines: The same for a reader, one fact a line.
+    """
+
+    networks: Networks
+    copied: list[str]
+    fitted: list[str] = field(default_factory=list)
+    details: dict[str, Any] = field(default_factory=dict)
+    lines: list[str] = field(default_factory=list)
+
+
+#: Student, teacher (None where the method's rules say that it needs none), settings, source of new weights.
+Method = Callable[[Student, Any, TransferConfig, torch.Generator], Taken]
 METHODS: Registry[Method] = Registry("transfer.name", "acmr.transfer")
 #: Registers a transfer method under the name of its YAML file.
 method = METHODS.add
 
 
 def transfer(
-    student: Networks,
+    student: Student,
     teacher: Teacher | None,
     config: TransferConfig,
     freeze: bool,
@@ -37,7 +72,7 @@ def transfer(
     """Gives a student what its method takes from the teacher, and freezes it where asked to.
 
     Args:
-        student: Fresh networks for the student's environment.
+        student: Fresh networks, and what sensors and actuators they are for.
         teacher: The teacher; None for a method that needs none.
         config: Method, its rules and its settings.
         freeze: Whether the copied layers stop learning.
@@ -51,59 +86,53 @@ def transfer(
     """
     take = METHODS.find(config.name)
     if teacher is not None:
-        check_body(config, f"the teacher {teacher.path}", teacher.description.dims, student.dims)
-        _check_widths(config, teacher, student)
-    networks, copied = take(student, teacher, config, generator)
-    if teacher is not None and not copied:
+        check_body(config, f"the teacher {teacher.path}", teacher.description.dims, student.networks.dims)
+        _check_widths(config, teacher, student.networks)
+    taken = take(student, teacher, config, generator)
+    if teacher is not None and not (taken.copied or taken.fitted):
         raise ConfigError(f"transfer={config.name}: no layer of {teacher.path} could be copied")
-    layers = networks.layers()
-    frozen = [name for name in layers if freeze and name in copied]
+    layers = taken.networks.layers()
+    frozen = [name for name in layers if freeze and name in taken.copied]
     for name in frozen:
         # The learner reads this: frozen layers are no part of what its optimizers step, nor of what its targets follow.
         layers[name].requires_grad_(False)
-    return networks, report_transfer(networks, teacher, config, freeze, copied, frozen)
+    report = report_transfer(taken.networks, teacher, config, freeze, (taken.copied, taken.fitted, frozen))
+    return taken.networks, replace(report, details=taken.details, notes=taken.lines)
 
 
 @method("none")
-def none(
-    student: Networks, teacher: None, config: TransferConfig, generator: torch.Generator
-) -> tuple[Networks, list[str]]:
+def none(student: Student, teacher: None, config: TransferConfig, generator: torch.Generator) -> Taken:
     """Nothing: the baselines (H0, A0)."""
-    return student, []
+    return Taken(student.networks, [])
 
 
 @method("direct")
-def direct(
-    student: Networks, teacher: Teacher, config: TransferConfig, generator: torch.Generator
-) -> tuple[Networks, list[str]]:
+def direct(student: Student, teacher: Teacher, config: TransferConfig, generator: torch.Generator) -> Taken:
     """All layers as they are, between environments of the same dimensions (experiment H1)."""
     about = teacher.description.architecture
     # A teacher that was itself expanded hands on its adapters, too.
-    networks = student.with_core(about.core, about.adapter_activation, generator)
-    return networks, copy_layers(networks, teacher, networks.layers())
+    networks = student.networks.with_core(about.core, about.adapter_activation, generator)
+    return Taken(networks, copy_layers(networks, teacher, networks.layers()))
 
 
 @method("hidden")
-def hidden(
-    student: Networks, teacher: Teacher, config: TransferConfig, generator: torch.Generator
-) -> tuple[Networks, list[str]]:
+def hidden(student: Student, teacher: Teacher, config: TransferConfig, generator: torch.Generator) -> Taken:
     """The layers between two hidden activations: no sensor or actuator touches them (A1, A2)."""
-    return student, copy_layers(student, teacher, filter(is_hidden, student.layers()))
+    networks = student.networks
+    return Taken(networks, copy_layers(networks, teacher, filter(is_hidden, networks.layers())))
 
 
 @method("expand")
-def expand(
-    student: Networks, teacher: Teacher, config: TransferConfig, generator: torch.Generator
-) -> tuple[Networks, list[str]]:
+def expand(student: Student, teacher: Teacher, config: TransferConfig, generator: torch.Generator) -> Taken:
     """All layers in the teacher's dimensions, between adapters to the student's (A3, A4)."""
     if teacher.description.core is not None:
         raise ConfigError(
             f"transfer=expand: the teacher {teacher.path} is itself expanded, and adapters are not stacked; "
             f"give the teacher it came from{config.rules.or_instead}"
         )
-    networks = student.with_core(teacher.description.dims, config.adapter_activation, generator)
+    networks = student.networks.with_core(teacher.description.dims, config.adapter_activation, generator)
     inner = [name for name in networks.layers() if f"{name}.weight" in teacher.tensors]
-    return networks, copy_layers(networks, teacher, inner)
+    return Taken(networks, copy_layers(networks, teacher, inner))
 
 
 def check_body(config: TransferConfig, owner: str, theirs: Dimensions, ours: Dimensions) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from acmr.agent.networks import Networks
@@ -13,15 +13,21 @@ from acmr.transfer.teacher import Teacher
 
 @dataclass(frozen=True)
 class TransferReport:
-    """Names of the copied, fresh and frozen layers, and how many parameters that is."""
+    """Names of the copied, fitted, fresh and frozen layers, and how many parameters that is.
+
+    ``details`` is what else the method has to say, ``notes`` the same in words.
+    """
 
     method: str
     freeze: bool
     teacher: dict[str, Any] | None
     copied: list[str]
+    fitted: list[str]
     fresh: list[str]
     frozen: list[str]
     parameters: dict[str, int]
+    details: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         """The report for a reader, one fact a line."""
@@ -31,8 +37,11 @@ class TransferReport:
                 f"  teacher: {self.teacher['path']} ({self.teacher['environment']}, seed {self.teacher['seed']}, "
                 f"{self.teacher['global_step']:,} steps)"
             )
-        for kind in ("copied", "fresh", "frozen"):
+        said += [f"  {note}" for note in self.notes]
+        for kind in ("copied", "fitted", "fresh", "frozen"):
             names: list[str] = getattr(self, kind)
+            if kind == "fitted" and not names:
+                continue
             said.append(f"  {kind}: {self.parameters[kind]:,} parameters: {', '.join(names) if names else 'no layer'}")
         said.append(f"  learning: {self.parameters['trainable']:,} of {self.parameters['total']:,} parameters")
         return said
@@ -43,8 +52,7 @@ def report_transfer(
     teacher: Teacher | None,
     config: TransferConfig,
     freeze: bool,
-    copied: list[str],
-    frozen: list[str],
+    layers: tuple[list[str], list[str], list[str]],
 ) -> TransferReport:
     """Counts what was done.
 
@@ -53,11 +61,11 @@ def report_transfer(
         teacher: Whom they have something from, if anybody.
         config: The method.
         freeze: Whether the copied layers were to be frozen.
-        copied: Names of the layers that hold the teacher's values.
-        frozen: Names of the layers that do not learn.
+        layers: Names of those that hold the teacher's values, of those that hold what fits of them, and of those that
+            do not learn.
     """
-    sizes = networks.architecture.sizes
-    fresh = [name for name in sizes if name not in copied]
+    sizes, (copied, fitted, frozen) = networks.architecture.sizes, layers
+    fresh = [name for name in sizes if name not in (*copied, *fitted)]
 
     def count(names: Iterable[str]) -> int:
         return sum(sizes[name] for name in names)
@@ -66,11 +74,12 @@ def report_transfer(
         "total": count(sizes),
         "trainable": count(sizes) - count(frozen),
         "copied": count(copied),
+        "fitted": count(fitted),
         "fresh": count(fresh),
         "frozen": count(frozen),
     }
     origin = _origin(teacher) if teacher is not None else None
-    return TransferReport(config.name, freeze, origin, copied, fresh, frozen, parameters)
+    return TransferReport(config.name, freeze, origin, copied, fitted, fresh, frozen, parameters)
 
 
 def _origin(teacher: Teacher) -> dict[str, Any]:

@@ -1,0 +1,40 @@
+"""A policy in a body that it did not learn in, before any learning: what fits of it by name."""
+
+from __future__ import annotations
+
+import torch
+
+from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.networks import Actor, Networks
+from acmr.config import ZERO, EnvConfig, TransferConfig
+from acmr.transfer.methods import Student
+from acmr.transfer.named import named
+from acmr.transfer.teacher import Teacher
+
+
+def policy_in(teacher: Teacher, config: EnvConfig, impute: str) -> tuple[Actor, list[str]]:
+    """The policy with which a student of ``transfer=named`` would begin.
+
+    Args:
+        teacher: Whose policy it is.
+        config: The body.
+        impute: What is gone counts as, one of ``acmr.config.IMPUTATIONS``.
+
+    Returns:
+        The policy, and what is kept, gone and added.
+
+    Raises:
+        ConfigError: If nothing fits by name, or an environment cannot be made.
+    """
+    from acmr.envs import describe
+    from acmr.transfer.statistics import with_statistics
+
+    about, learned = describe(config), teacher.description
+    dims = Dimensions(len(about.observation_names), len(about.action_names))
+    sizes = tuple(learned.hidden_sizes)
+    generator = torch.Generator().manual_seed(0)
+    fresh = Networks(Architecture(dims, sizes, about.action_low, about.action_high), generator)
+    student = Student(fresh, about.observation_names, about.action_names)
+    told = teacher if impute == ZERO else with_statistics(teacher)
+    taken = named(student, told, TransferConfig(name="named", impute=impute), generator)
+    return taken.networks.actor.eval(), taken.lines
