@@ -17,6 +17,7 @@ from acmr.config import HORIZON, STOP_KEYS, differing_keys
 from acmr.settings.compose import compose_config, parse
 from analysis.analyze import analyze
 from analysis.loading.load import load
+from docs import results
 
 ROOT = Path(__file__).resolve().parent.parent
 PUBLISHED = ROOT / "results" / "paper"
@@ -64,6 +65,10 @@ def test_the_page_of_results_tells_the_same(run):
         f"{summary['steps_per_second']:.0f}",
     ):
         assert f" {told} |" in rows[0], told
+
+
+def test_the_tables_on_that_page_are_what_its_command_prints():
+    assert results.filled(results.PAGE.read_text()) == results.PAGE.read_text(), "type python -m docs.results"
 
 
 def test_a_student_learns_from_the_published_teacher(tmp_path):
