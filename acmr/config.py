@@ -27,6 +27,8 @@ STOP_KEYS = ("stop", "stop_after")
 PROGRESS_MODES = ("auto", "bar", "lines", "off")
 #: How matrix products are computed.
 PRECISIONS = ("float32", "bfloat16")
+#: Who acts before learning starts.
+RANDOM, POLICY = "random", "policy"
 EXACT, INEXACT = "exact", "inexact"
 ACTIVATIONS = ("relu", "none")
 #: What a sensor or an actuator that is gone counts as in the networks that knew it (``transfer=named``).
@@ -79,8 +81,10 @@ class SACConfig:
     batch_size: int = 256
     #: Transitions that the replay buffer holds; the oldest go first.
     buffer_size: int = 1_000_000
-    #: Steps with uniformly random actions before the first update.
+    #: Steps before the first update.
     learning_starts: int = 5_000
+    #: Who acts in them: ``random``, uniformly within the bounds, or the ``policy``, as it was transferred.
+    start: str = RANDOM
     #: Learning rate of the actor (Adam).
     policy_lr: float = 3e-4
     #: Learning rate of the critics and of the temperature (Adam).

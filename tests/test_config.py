@@ -65,7 +65,8 @@ def test_paper_profile_has_the_papers_values():
     assert (config.threshold, config.consecutive) == (4900, 5)
     assert config.agent == SACConfig(
         hidden_sizes=[256, 256], gamma=0.99, tau=0.005, batch_size=256, buffer_size=1_000_000, learning_starts=5000,
-        policy_lr=3e-4, q_lr=1e-3, policy_frequency=2, target_network_frequency=1, autotune=True, alpha=0.2,
+        start="random", policy_lr=3e-4, q_lr=1e-3, policy_frequency=2, target_network_frequency=1, autotune=True,
+        alpha=0.2,
     )  # fmt: skip
     assert not config.transfer.copy_log_alpha
     assert config.transfer.adapter_activation == "relu"

@@ -112,7 +112,7 @@ def test_what_is_no_fault(text: str, folders: tuple[Path, Path]) -> None:
         ("matrix/bad.yaml", MATRIX, ["matrix=bad"],
          "bad.yaml: hydra.sweeper.params: sed: no such setting; did you mean seed? (line 2, column 44)"),
         ("env/good.yaml", ANT.encode(), ["env=null"], "env=null: must be one of ant, "),
-        ("env/good.yaml", ANT.encode(), ["transfer=3"], "transfer=3: must be one of direct, expand, hidden, none"),
+        ("env/good.yaml", ANT.encode(), ["transfer=3"], "transfer=3: must be one of direct, expand, hidden, named"),
     ],
 )  # fmt: skip
 def test_as_a_user_sees_it(file: str, content: bytes, words: list[str], says: str, tmp_path: Path) -> None:

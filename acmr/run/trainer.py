@@ -14,7 +14,7 @@ import torch
 from acmr.agent.architecture import Dimensions
 from acmr.agent.learner import Learner
 from acmr.agent.replay_buffer import ReplayBuffer
-from acmr.config import THRESHOLD, ConfigError, ExperimentConfig
+from acmr.config import RANDOM, THRESHOLD, ConfigError, ExperimentConfig
 from acmr.envs.conversion import FaultyEnvironmentError
 from acmr.records import EpisodeInProgress
 from acmr.run.preparation import Prepared
@@ -131,8 +131,9 @@ class Trainer:
             observation, _ = self.env.reset(seed=None if self.global_step else self.streams.environment)
             self._check("an observation", observation)
         self.global_step += 1
-        exploring = self.global_step <= config.learning_starts
-        action = self._random_action() if exploring else self.agent.act(observation)
+        learning = self.global_step > config.learning_starts
+        explores = config.start == RANDOM and not learning
+        action = self._random_action() if explores else self.agent.act(observation)
         self._check("the policy's action", action)
         next_observation, reward, terminated, truncated, info = self.env.step(action)
         reward, ended = float(reward), terminated or truncated
@@ -147,7 +148,7 @@ class Trainer:
                 observer.on_episode(record)
             self.episode.restart()
             self.observation = None
-        if not exploring:
+        if learning:
             self.agent.update(self.buffer.sample(config.batch_size, self.streams.replay), self.global_step)
 
     def _log(self, speed: float) -> None:

@@ -10,8 +10,10 @@ from acmr.config import (
     HORIZON,
     IMPUTATIONS,
     INEXACT,
+    POLICY,
     PRECISIONS,
     PROGRESS_MODES,
+    RANDOM,
     THRESHOLD,
     ConfigError,
     ExperimentConfig,
@@ -57,6 +59,7 @@ def validate(config: ExperimentConfig) -> None:
     if max(agent.hidden_sizes) > MOST_SEED:
         raise ConfigError(f"agent.hidden_sizes={agent.hidden_sizes}: integers of at most {MOST_SEED} are needed")
     _one_of("agent.precision", agent.precision, PRECISIONS)
+    _one_of("agent.start", agent.start, (RANDOM, POLICY))
     _one_of("progress", config.progress, PROGRESS_MODES)
     _one_of("resume", config.resume, (EXACT, INEXACT))
     _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)

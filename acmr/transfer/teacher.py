@@ -44,7 +44,7 @@ class Teacher:
 
 def save_teacher(folder: Path, networks: Networks, description: TeacherDescription) -> None:
     """Writes both files of a teacher, each whole or not at all."""
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in networks.state_dict().items()}
+    tensors = {name: tensor.detach().cpu().float().contiguous() for name, tensor in networks.state_dict().items()}
     _write(folder, tensors, description)
 
 

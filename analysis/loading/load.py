@@ -40,8 +40,8 @@ class RunSet:
             comparisons), ``episodes`` (number), ``last_step`` (end of the last episode), ``horizon`` (step up to which
             the run is known not to have reached the threshold, if it has not), ``cut`` (ends at its own threshold, as
             ``stop=threshold`` has it, before its last step), ``stop_after`` (step at which such a run ends at the
-            latest), ``total_timesteps``, ``learning_starts``, ``threshold``, ``consecutive``, ``wall_seconds``,
-            ``steps_per_second``.
+            latest), ``total_timesteps``, ``learning_starts``, ``acts_from`` (step from which the agent chooses its
+            actions), ``threshold``, ``consecutive``, ``wall_seconds``, ``steps_per_second``.
         episodes: One row an episode: ``run, group, seed`` and the columns of ``episodes.csv``; steps ascend within a
             run.
         configs: The settings of each run that has them.
@@ -118,7 +118,7 @@ def _named(runs: list[FoundRun]) -> dict[str, FoundRun]:
 _RUN_COLUMNS = (
     *("run", "directory", "group", "cell", "seed", "profile", "env", "transfer", "freeze", "state", "reason"),
     *("episodes", "last_step", "horizon", "cut"),
-    *("total_timesteps", "stop_after", "learning_starts", "threshold", "consecutive"),
+    *("total_timesteps", "stop_after", "learning_starts", "acts_from", "threshold", "consecutive"),
     *("wall_seconds", "steps_per_second", "steps_in_summary"),
 )
 _FLOATS = _RUN_COLUMNS[_RUN_COLUMNS.index("total_timesteps") :]

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from acmr.cells import stops
-from acmr.config import THRESHOLD
+from acmr.config import POLICY, THRESHOLD
 from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
@@ -149,14 +149,16 @@ def _measures(
     reached = number(summary.get("global_step"))
     # What a run that diverged would have returned afterwards is known: nothing. It did not reach in all its time.
     ends = {COMPLETE: (reached, total), DIVERGED: (total, reached)}.get(state, ())
-    agent = config.get("agent")
-    starts = agent.get("learning_starts") if isinstance(agent, dict) else None
+    given = config.get("agent")
+    agent = given if isinstance(given, dict) else {}
+    starts = number(agent.get("learning_starts"))
     return {
         "episodes": len(frame),
         "last_step": last,
         "horizon": max(last, int(next((end for end in ends if end is not None), last))),
         "total_timesteps": total,
-        "learning_starts": number(starts),
+        "learning_starts": starts,
+        "acts_from": 0.0 if agent.get("start") == POLICY else starts,
         "threshold": number(summary.get("threshold", config.get("threshold"))),
         "consecutive": number(summary.get("consecutive", config.get("consecutive"))),
         "wall_seconds": number(summary.get("wall_seconds")),

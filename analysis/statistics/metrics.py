@@ -44,8 +44,8 @@ def initial_return(
 ) -> float:
     """Mean return of the first episodes that began once the agent itself chose its actions.
 
-    Every run begins with ``learning_starts`` random actions, also one with a transfer: before them there is nothing
-    of the agent to see.
+    A run begins with ``learning_starts`` random actions, also one with a transfer, unless it has
+    ``agent.start=policy``: before them there is nothing of the agent to see.
 
     Args:
         global_steps: Step at each episode's end, (episodes,), ascending.
@@ -143,7 +143,7 @@ def measure(data: RunSet, threshold: float, consecutive: int) -> pd.DataFrame:
         empty (:func:`analysis.statistics.early_ends.settle` fills it).
     """
     rows: dict[str, dict[str, Any]] = {}
-    starts = data.runs["learning_starts"].fillna(0.0).to_dict()
+    starts = data.runs["acts_from"].fillna(0.0).to_dict()
     for name, episodes in data.episodes.groupby("run", observed=False, sort=False):
         start = float(starts[str(name)])
         rows[str(name)] = _measure_run(episodes, start, threshold, consecutive)
