@@ -71,13 +71,14 @@ class Published:
 def _silent(line: str) -> None: ...
 
 
-def publish(runs: Path, out: Path, say: Callable[[str], None] = _silent) -> Published:
+def publish(runs: Path, out: Path, say: Callable[[str], None] = _silent, trust: bool = False) -> Published:
     """Copies the records of every run that has come to its end, and the networks with an evaluation of those complete.
 
     Args:
         runs: Folder of runs, as ``runs/paper``.
         out: Folder that they are added to, under the same names.
         say: Told of every evaluation before it is made, for it takes a while.
+        trust: Whether an evaluation may run the code that a run's own files name.
 
     Raises:
         PublishError: If there is nothing to publish, ``out`` holds other results of a run, or it would become too
@@ -105,7 +106,7 @@ def publish(runs: Path, out: Path, say: Callable[[str], None] = _silent) -> Publ
         (out / run).mkdir(parents=True, exist_ok=True)
         for name in names:
             _write(out / run / name, found[run][name])
-        evaluated = _evaluate(runs / run, out / run, say, done.left_out)
+        evaluated = _evaluate(runs / run, out / run, say, done.left_out, trust)
         (done.added if names or evaluated else done.there).append(out / run)
     return done
 
@@ -146,7 +147,7 @@ def _halved(run: Path, target: Path, scratch: Path) -> Path:
     return folder
 
 
-def _evaluate(run: Path, target: Path, say: Callable[[str], None], left_out: list[str]) -> bool:
+def _evaluate(run: Path, target: Path, say: Callable[[str], None], left_out: list[str], trust: bool) -> bool:
     """Adds an evaluation of the published networks, if there are networks and it is not there; whether it did."""
     path, about = target / EVALUATION_FILE, _json(target / DESCRIPTION_FILE)
     if path.exists() or not about:
@@ -159,7 +160,7 @@ def _evaluate(run: Path, target: Path, say: Callable[[str], None], left_out: lis
     say(f"evaluating {target}, {EPISODES} episodes")
     # Relative, so that no path of this machine is published.
     arguments = (os.path.relpath(target), "--episodes", str(EPISODES), "--seed", str(FIRST_SEED))
-    problem = _run("acmr.evaluation", *arguments)
+    problem = _run("acmr.evaluation", *arguments, *(["--trust"] if trust else []))
     if problem:
         left_out.append(f"no {EVALUATION_FILE} in {target}: {problem}")
     return not problem
@@ -217,6 +218,10 @@ def _write(path: Path, data: bytes) -> None:
     os.replace(unfinished, path)
 
 
+def _print(line: str) -> None:
+    print(terminal(line), flush=True)
+
+
 def _report(done: Published) -> Iterator[str]:
     for run in done.added:
         yield f"added    {run} ({size(sum(path.stat().st_size for path in run.iterdir()))})"
@@ -231,9 +236,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m analysis.publish", description="Finished runs, to be committed.")
     parser.add_argument("runs", type=Path, help="folder of runs, as runs/paper")
     parser.add_argument("out", type=Path, help="where they are added, as results/paper")
+    parser.add_argument("--trust", action="store_true", help="run code that the runs' own files name, to evaluate them")
     arguments = parser.parse_args()
     try:
-        done = publish(arguments.runs, arguments.out, say=lambda line: print(terminal(line), flush=True))
+        done = publish(arguments.runs, arguments.out, _print, arguments.trust)
         print("\n".join(map(terminal, _report(done))))
     except (OSError, ValueError) as error:
         print(terminal(f"analysis.publish: {error}"), file=sys.stderr)

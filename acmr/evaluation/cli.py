@@ -64,6 +64,9 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument(
         "--impute", choices=IMPUTATIONS, default=MEAN, help="what is gone in another body counts as; default: mean"
     )
+    parser.add_argument(
+        "--trust", action="store_true", help="run the code that the run's own files name: only where you know them"
+    )
     parser.add_argument("--stochastic", action="store_true", help="sample actions, as in training")
     parser.add_argument(
         "--video", type=_film, metavar="FILE.mp4", help="film the first episode; or .gif (0.2 s a frame without a GPU)"

@@ -20,6 +20,7 @@ from acmr.evaluation.rollout import MOST_STEPS, Episode, VideoOptions, play, ren
 from acmr.evaluation.zero_shot import policy_in
 from acmr.records import CONFIG_FILE, EVALUATION_FILE
 from acmr.settings.compose import environment_config
+from acmr.settings.stored import stored_environment
 from acmr.storage.durable import WriteError
 from acmr.storage.json_files import write_json
 from acmr.storage.run_dir import RunDir
@@ -29,11 +30,15 @@ from acmr.transfer.teacher import Teacher, load_teacher
 _STILL_AZIMUTH, _STILL_CLOSENESS = 150.0, 0.85
 
 
-def load_run(path: Path) -> tuple[Teacher, EnvConfig]:
+def load_run(path: Path, trust: bool = False) -> tuple[Teacher, EnvConfig]:
     """The final networks of a finished run, and the environment they learned in.
 
+    Args:
+        path: Its directory.
+        trust: Whether its files may choose code to run.
+
     Raises:
-        ConfigError: If there is no such run, if it is unfinished, or if one of its files is damaged.
+        ConfigError: If there is no such run, if it is unfinished, if one of its files is damaged, or chooses code.
     """
     run_dir = RunDir(path)
     if not path.is_dir():
@@ -43,10 +48,7 @@ def load_run(path: Path) -> tuple[Teacher, EnvConfig]:
         raise ConfigError(f"{path}: not a run directory (no {CONFIG_FILE}); give one as in runs/quick/ant-none/seed_1")
     if not run_dir.is_complete():
         raise ConfigError(f"{path}: this run is not finished; start it again with the command that began it")
-    try:
-        config = EnvConfig(**settings["env"])
-    except (KeyError, TypeError) as error:
-        raise ConfigError(f"{run_dir.config_file}: damaged, its part env cannot be used ({error})") from error
+    config = stored_environment(settings, run_dir.config_file, "type --trust", trust)
     return load_teacher(path), config
 
 
@@ -104,7 +106,7 @@ def report(episodes: Sequence[Episode], **about: Any) -> dict[str, Any]:
 
 def evaluate(given: argparse.Namespace) -> None:
     """Evaluates a run, prints each episode and writes the result as JSON; in each body that is asked for."""
-    teacher, own = load_run(given.run_dir)
+    teacher, own = load_run(given.run_dir, given.trust)
     contents = []
     for name in given.env or [None]:
         config = own if name is None else environment_config(name)
@@ -128,7 +130,7 @@ def _policy(
         if remark:
             print(f"warning: {remark}", file=sys.stderr)
         return remark, teacher.build_networks().actor.eval()
-    actor, lines = policy_in(teacher, config, given.impute)
+    actor, lines = policy_in(teacher, config, given.impute, given.trust)
     print(f"{config.name}: {'; '.join(lines)}")
     return None, actor
 

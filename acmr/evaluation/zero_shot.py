@@ -12,13 +12,14 @@ from acmr.transfer.named import named
 from acmr.transfer.teacher import Teacher
 
 
-def policy_in(teacher: Teacher, config: EnvConfig, impute: str) -> tuple[Actor, list[str]]:
+def policy_in(teacher: Teacher, config: EnvConfig, impute: str, trust: bool = False) -> tuple[Actor, list[str]]:
     """The policy with which a student of ``transfer=named`` would begin.
 
     Args:
         teacher: Whose policy it is.
         config: The body.
         impute: What is gone counts as, one of ``acmr.config.IMPUTATIONS``.
+        trust: Whether the teacher's files may choose code to run.
 
     Returns:
         The policy, and what is kept, gone and added.
@@ -35,6 +36,6 @@ def policy_in(teacher: Teacher, config: EnvConfig, impute: str) -> tuple[Actor, 
     generator = torch.Generator().manual_seed(0)
     fresh = Networks(Architecture(dims, sizes, about.action_low, about.action_high), generator)
     student = Student(fresh, about.observation_names, about.action_names)
-    told = teacher if impute == ZERO else with_statistics(teacher)
+    told = teacher if impute == ZERO else with_statistics(teacher, "type --trust, or --impute zero", trust)
     taken = named(student, told, TransferConfig(name="named", impute=impute), generator)
     return taken.networks.actor.eval(), taken.lines

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, fields, is_dataclass
 from difflib import get_close_matches
@@ -20,7 +20,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue
 
 from acmr.config import ConfigError, EnvConfig, ExperimentConfig, TransferRules, flatten, schema_defaults
 from acmr.settings.files import read_files_with_care
@@ -128,35 +128,6 @@ def _refuse_unknown(node: DictConfig, prefix: str = "") -> None:
             raise ConfigError(unknown_key(f"{prefix}{key}"))
         if not OmegaConf.is_missing(node, key) and isinstance(node[key], DictConfig):
             _refuse_unknown(node[key], f"{prefix}{key}.")
-
-
-def stored_config(settings: object) -> ExperimentConfig:
-    """Types the content of a run's ``config.yaml``, whichever version of this program wrote it.
-
-    A setting that it lacks has the schema's default; one that the schema knows no more is left out.
-
-    Raises:
-        ConfigError: If these are no settings.
-    """
-    if not isinstance(settings, Mapping):
-        raise ConfigError("no settings")
-    try:
-        known = _known(ExperimentConfig(), settings)
-        config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ExperimentConfig), known))
-    except OmegaConfBaseException as error:
-        raise ConfigError(str(error).strip().splitlines()[0]) from error
-    assert isinstance(config, ExperimentConfig)
-    return config
-
-
-def _known(schema: Any, settings: Mapping[Any, Any]) -> dict[str, Any]:
-    known = {}
-    for entry in fields(schema):
-        if entry.name in settings:
-            value, default = settings[entry.name], getattr(schema, entry.name)
-            nested = is_dataclass(default) and isinstance(value, Mapping)
-            known[entry.name] = _known(default, value) if nested else value
-    return known
 
 
 def setting_keys() -> list[str]:

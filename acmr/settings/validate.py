@@ -16,6 +16,7 @@ from acmr.config import (
     RANDOM,
     THRESHOLD,
     ConfigError,
+    EnvConfig,
     ExperimentConfig,
 )
 from acmr.records import MOST_SEED
@@ -43,8 +44,7 @@ def validate(config: ExperimentConfig) -> None:
     _at_least("agent.learning_starts", agent.learning_starts, 0)
     if config.checkpoint_every is not None:
         _at_least("checkpoint_every", config.checkpoint_every, 0)
-    if config.env.max_episode_steps is not None:
-        _at_least("env.max_episode_steps", config.env.max_episode_steps, 1)
+    check_environment(config.env)
     for key in ("policy_lr", "q_lr", "alpha"):
         _within(f"agent.{key}", getattr(agent, key), low=0.0, high=math.inf, low_open=True)
     _within("agent.tau", agent.tau, low=0.0, high=1.0, low_open=True)
@@ -68,6 +68,16 @@ def validate(config: ExperimentConfig) -> None:
         raise ConfigError("tracking=self_hosted needs the server's address: type tracking.base_url=http://HOST:PORT")
     _check_transfer(config)
     _check_stop(config)
+
+
+def check_environment(config: EnvConfig) -> None:
+    """Refuses an environment that cannot be played, whatever it is.
+
+    Raises:
+        ConfigError: As :func:`validate`.
+    """
+    if config.max_episode_steps is not None:
+        _at_least("env.max_episode_steps", config.max_episode_steps, 1)
 
 
 def _check_stop(config: ExperimentConfig) -> None:

@@ -20,8 +20,9 @@ import yaml
 from acmr.command import command
 from acmr.config import ConfigError
 from acmr.records import CONFIG_FILE, SUMMARY_FILE
-from acmr.settings.compose import compose_config, options, parse, stored_config
+from acmr.settings.compose import compose_config, options, parse
 from acmr.settings.run_spec import RunSpec
+from acmr.settings.stored import stored_config
 from acmr.text import message
 from acmr.tracking.observer import Say
 from acmr.tracking.wandb_backend import linked_mirrors, server_problem, wandb_environment
@@ -30,13 +31,15 @@ from acmr.tracking.watchers import make_tracker, replay
 _EXAMPLE = "runs/paper/armless_humanoid-hidden-frozen/seed_3"
 
 
-def rebuild(run_dir: Path, tracking: str, say: Say) -> None:
+def rebuild(run_dir: Path, tracking: str, say: Say, folder: str | None = None) -> None:
     """Writes what a tracker shows of a run anew from the run's own files, in place of what there may be.
 
     Args:
         run_dir: The run's directory, finished or not: ``<output_dir>/<profile>/<run>/seed_<n>``.
         tracking: Name of a file in ``conf/tracking``, whichever the run itself was made with.
         say: Takes one line if it cannot be written.
+        folder: Where mirrors go; None: ``<output_dir>/wandb``. What the run's own settings say of it may be of another
+            machine, or of somebody else.
 
     Raises:
         ConfigError: If this is no run's directory.
@@ -48,9 +51,9 @@ def rebuild(run_dir: Path, tracking: str, say: Say) -> None:
     except (OSError, yaml.YAMLError, ValueError) as error:
         raise ConfigError(f"{run_dir} is no run's directory ({message(error)}); give one as in {_EXAMPLE}") from error
     chosen = parse(compose_config([f"tracking={tracking}", "tracking.base_url=null"])).tracking
-    # The run's own project and folder, and its place as it is now: it may have been moved.
-    own = replace(config.tracking, tracker=chosen.tracker, options=chosen.options, base_url=None)
-    config = replace(config, tracking=own, output_dir=str(run_dir.parents[2]))
+    own = replace(config.tracking, tracker=chosen.tracker, options=chosen.options, base_url=None, dir=folder)
+    # What is removed and written lies where the run does, whatever its files say.
+    config = replace(config, tracking=own, **_place(run_dir, config.seed))
     tracker = make_tracker(RunSpec(config, {}, run_dir.parent.name, summary.get("cell") if summary else None), say)
     replay(tracker, run_dir)
     tracker.close(summary)
@@ -117,6 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     again = commands.add_parser("rebuild", help="write the mirrors of runs anew from their own files")
     again.add_argument("--tracking", default="offline", choices=options("tracking"), help="default: offline (W&B)")
+    again.add_argument("--dir", metavar="FOLDER", help="of the mirrors; default: wandb, in the folder of all runs")
     again.add_argument("run_dirs", nargs="+", type=Path, metavar="RUN_DIR")
     send = commands.add_parser("sync", help="send offline mirrors to a server (key: WANDB_API_KEY)")
     send.add_argument("--base-url", default=os.environ.get("WANDB_BASE_URL") or None, help="as in http://HOST:PORT")
@@ -128,7 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if given.command == "rebuild":
             for run_dir in given.run_dirs:
-                rebuild(run_dir, given.tracking, problems.append)
+                rebuild(run_dir, given.tracking, problems.append, given.dir)
         elif given.command == "dashboard":
             dashboard(given.folder)
         elif not given.base_url:
@@ -142,6 +146,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for problem in problems:
         print(f"error: {problem}", file=sys.stderr)
     return 2 if problems else 0
+
+
+def _place(run_dir: Path, seed: int) -> dict[str, Any]:
+    """The settings that a run's place follows from, ``<output_dir>/<profile>/<run>/seed_<n>``."""
+    if len(run_dir.parts) < 5 or run_dir.name != f"seed_{seed}":
+        raise ConfigError(
+            f"{run_dir} is no run's directory (its settings are of seed {seed}); give one as in {_EXAMPLE}"
+        )
+    return {"output_dir": str(run_dir.parents[2]), "profile": run_dir.parents[1].name}
 
 
 def _summary(run_dir: Path) -> dict[str, Any] | None:

@@ -9,13 +9,17 @@ import numpy as np
 import torch
 
 from acmr.agent.networks import Actor
-from acmr.config import ConfigError, EnvConfig
+from acmr.config import EnvConfig
 from acmr.envs import make_env
+from acmr.records import DESCRIPTION_FILE
+from acmr.settings.stored import stored_environment
 from acmr.transfer.description import PolicyStatistics
 from acmr.transfer.teacher import Teacher
 
 #: Episodes that are played, and the most steps of each: an environment may have no time limit.
 EPISODES, MOST_STEPS = 10, 1_000
+#: What a student's command line says in place of that environment.
+_REMEDY = "describe that environment in conf/env; else type transfer.impute=zero"
 
 
 def measure_policy(actor: Actor, config: EnvConfig) -> PolicyStatistics:
@@ -56,8 +60,13 @@ def measure_policy(actor: Actor, config: EnvConfig) -> PolicyStatistics:
     )
 
 
-def with_statistics(teacher: Teacher) -> Teacher:
+def with_statistics(teacher: Teacher, remedy: str = _REMEDY, trust: bool = False) -> Teacher:
     """The teacher as it is if it knows its statistics, else with those of its policy in its own environment.
+
+    Args:
+        teacher: The teacher.
+        remedy: What to type where its environment would run code that its files choose.
+        trust: Whether that has been typed.
 
     Raises:
         ConfigError: If its environment is not one that its description alone may choose, or cannot be made.
@@ -65,16 +74,8 @@ def with_statistics(teacher: Teacher) -> Teacher:
     about = teacher.description
     if about.statistics is not None:
         return teacher
-    try:
-        config = EnvConfig(**about.config["env"])
-    except (KeyError, TypeError) as error:
-        raise ConfigError(f"{teacher.path}: its settings of the environment cannot be used ({error})") from error
-    if ":" in config.id:
-        # A stored file must not choose which module is imported.
-        raise ConfigError(
-            f"{teacher.path}: it does not say what its policy saw, and its environment {config.id} would run code that "
-            "only you can choose; type transfer.impute=zero"
-        )
+    beside = teacher.path.with_name(DESCRIPTION_FILE)
+    config = stored_environment(about.config, f"{beside} (it does not say what its policy saw)", remedy, trust)
     measured = measure_policy(teacher.build_networks().actor, config)
     return replace(teacher, description=replace(about, statistics=measured))
 

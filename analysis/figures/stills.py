@@ -5,6 +5,7 @@ The analysis itself imports neither MuJoCo nor torch; and a GL library that cras
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -16,16 +17,19 @@ import numpy as np
 #: Seconds that a picture may take.
 PATIENCE = 180
 SIZE = 480
+#: A name in ``conf/env``, or an id that Gymnasium itself knows. The names come from the settings of runs, and
+#: ``module:Name-v0`` would run code that nobody here has chosen; what begins with a hyphen would be an option.
+_PLAIN = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_.-]+)?")
 
 
 @dataclass(frozen=True)
 class Still:
-    """A picture being rendered."""
+    """A picture being rendered; without a process it is not."""
 
     name: str
     env: str
     path: Path
-    process: subprocess.Popen[str]
+    process: subprocess.Popen[str] | None
 
 
 def start(pair: tuple[str, str], folder: Path) -> list[Still]:
@@ -38,6 +42,9 @@ def start(pair: tuple[str, str], folder: Path) -> list[Still]:
     stills = []
     for name, env in zip(("figure_2", "figure_3"), pair, strict=True):
         path = folder / f"{name}.png"
+        if not _PLAIN.fullmatch(env):
+            stills.append(Still(name, env, path, None))
+            continue
         command = [sys.executable, "-m", "acmr.evaluation", "still", env, "--out", str(path)]
         command += ["--width", str(SIZE), "--height", str(SIZE)]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -51,6 +58,8 @@ def finish(still: Still) -> tuple[np.ndarray | None, str]:
     Returns:
         The picture, (height, width, channels), or None and one line that says why there is none.
     """
+    if still.process is None:
+        return None, f"no picture of {still.env}: runs can name environments of conf/env and of Gymnasium only"
     try:
         _, said = still.process.communicate(timeout=PATIENCE)
     except subprocess.TimeoutExpired:
@@ -68,6 +77,6 @@ def finish(still: Still) -> tuple[np.ndarray | None, str]:
 def stop(stills: list[Still]) -> None:
     """Ends children that are still at work (the analysis itself failed)."""
     for still in stills:
-        if still.process.poll() is None:
+        if still.process is not None and still.process.poll() is None:
             still.process.kill()
             still.process.communicate()
