@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass
+from functools import cached_property
 
 import pandas as pd
 
@@ -15,6 +16,7 @@ from analysis.loading.read_run import DAMAGED, SUPERSEDED
 from analysis.statistics.comparisons import check_reference, compare_cells, compare_groups
 from analysis.statistics.early_ends import settle
 from analysis.statistics.metrics import measure
+from analysis.statistics.study.study import Study, study
 from analysis.statistics.summaries import cell_table
 
 #: The paper's threshold and count (section 4.2), for runs that do not say theirs.
@@ -62,6 +64,11 @@ class Analysis:
         odd = self.measured[self.measured["reason"].str.contains(DIFFERS, regex=False)]
         contradictions = [f"{name} ({run['state']}): {run['reason']}" for name, run in odd.iterrows()]
         return [*dict.fromkeys(filter(None, self.measured["bias"])), *contradictions]
+
+    @cached_property
+    def study(self) -> Study:
+        """What stands beyond table 3; it takes seconds, and not everybody who analyzes asks for it."""
+        return study(self.data, self.measured, self.threshold, self.consecutive, self.reference)
 
     @property
     def comparisons(self) -> pd.DataFrame:

@@ -11,6 +11,7 @@ from acmr.names import terminal
 from analysis.analyze import Analysis, analyze
 from analysis.loading.load import load
 from analysis.loading.missing import matrix_command, missing_runs, planned_seeds, profile_of
+from analysis.report.study import sensitivity_lines
 from analysis.report.terminal import left_out_lines, missing_lines, print_summary, result_lines
 
 
@@ -27,9 +28,18 @@ def run(options: argparse.Namespace) -> int:
     closing = [] if options.summary else _write(analysis, options)
     title = f"Steps to threshold {analysis.threshold:g} ({analysis.consecutive} episodes in a row), {profile_of(data)}"
     print_summary(analysis.cells, analysis.comparisons, title)
+    if options.summary:
+        print_study(analysis)
     biases = dict.fromkeys(filter(None, analysis.measured["bias"]))
     print("\n".join(map(terminal, ["", *biases, *left_out_lines(analysis.measured), *lines, *closing])))
     return 0
+
+
+def print_study(analysis: Analysis) -> None:
+    """Prints what stands beyond table 3."""
+    parts = {"Sensitivity to threshold and criterion": sensitivity_lines(analysis.study.overview)}
+    for title, lines in parts.items():
+        print("\n".join(map(terminal, ["", title, *(f"  {line}" for line in lines)])))
 
 
 def _write(analysis: Analysis, options: argparse.Namespace) -> list[str]:

@@ -42,6 +42,7 @@ class FigureData:
         planned: Seeds that a group is planned to have.
         curves: One row for each run and point: ``group, seed, step`` and the rolling averages of ``QUANTITIES``.
         speeds: One row for each run and point: ``group, run, step, steps_per_second``.
+        sensitivity: The comparisons at other thresholds (:func:`analysis.statistics.study.sensitivity.sensitivity`).
     """
 
     runs: pd.DataFrame
@@ -53,6 +54,7 @@ class FigureData:
     planned: int
     curves: pd.DataFrame = field(default_factory=pd.DataFrame)
     speeds: pd.DataFrame = field(default_factory=pd.DataFrame)
+    sensitivity: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     def drawn(self, group: str) -> pd.DataFrame:
         """The runs of a group that are drawn: those that count, or, while there are none, the unfinished ones."""

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from acmr.cells import CELLS, SOURCE, TARGET
-from analysis.figures import rows, steps, survival
+from analysis.figures import rows, sensitivity, steps, survival
 from analysis.figures.data import Draw, FigureData, FigureSpec, mean_curve
 from analysis.figures.parts import count_label, mark_leaving, marker_style, short_steps, step_axis
 from analysis.figures.style import COLUMN, PALETTES, Palette
@@ -102,6 +102,7 @@ FIGURES = (
         _paper_figure(_SOURCE, dict(zip(_SOURCE, _FIRST_COLORS, strict=False))),
     ),
     *survival.FIGURES,
+    *sensitivity.FIGURES,
     *steps.FIGURES,
     *rows.FIGURES,
 )

@@ -19,7 +19,7 @@ from analysis.analyze import Analysis
 from analysis.loading.missing import matrix_command, profile_of
 from analysis.loading.setting_differences import setting_differences
 from analysis.loading.speed import METRICS_FILES
-from analysis.report import prose
+from analysis.report import prose, study
 from analysis.report.published import published_table3
 from analysis.report.tables import footnote, heading, marked, readable
 
@@ -110,6 +110,7 @@ def write_report(report: Report, folder: Path, out: Path) -> Path:
         source=published_table3()["source"].iloc[0],
         detailed=_detailed(numbers.table3),
         notes=_notes,
+        study_words=study,
         defining=_table(defining, head=str),
         differing=_table(differing, head=str),
         about_n=prose.about_n(numbers.table3, numbers.data.cells),

@@ -27,7 +27,10 @@ WIDE = 6
 SENTENCE = 30
 
 _COUNTS = ("n_", "runs", "censored", "seed", "episodes", "reached")
-_STEPS = ("mean_", "std_", "difference", "restricted_", "steps", "low", "high", "horizon", "last_step", "mean", "std")
+_STEPS = (
+    *("mean_", "std_", "difference", "restricted_", "steps", "low", "high", "horizon", "last_step", "mean", "std"),
+    *("asked",),
+)
 
 
 def write_table(table: pd.DataFrame, out: Path, name: str, caption: str, columns: list[str] | None = None) -> None:
@@ -169,6 +172,8 @@ def _cell_text(column: str, value: object, missing: str) -> str:
         return str(value)
     if pd.isna(value):
         return missing
+    if column == "threshold":
+        return f"{value:g}"
     if isinstance(value, int | np.integer) or column.startswith(_COUNTS) or column.startswith(_STEPS):
         return f"{value:,.0f}"
     return f"{value:.3f}"

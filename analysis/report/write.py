@@ -74,13 +74,16 @@ def write_results(analysis: Analysis, folder: Path, out: Path, options: argparse
 
 
 def _write_tables(analysis: Analysis, out: Path, written: Written) -> dict[str, pd.DataFrame]:
-    data, measured = analysis.data, analysis.measured
+    data, measured, study = analysis.data, analysis.measured, analysis.study
     plan = {
         "table1": (table1(), "Overview of ACMR configurations.", None),
         "table2": (table2(data), "Experiment overview.", None),
         "table3": (analysis.table3, "Statistical comparison of steps to threshold.", paper_columns(analysis.table3)),
         "published_table3": (side_by_side(analysis.table3), "Table 3 beside the published one.", None),
         "transfer": (transfer_table(measured, data.groups, analysis.reference), "Transfer metrics.", None),
+        "sensitivity": (study.sensitivity, "Differences by threshold and criterion.", None),
+        "sensitivity_points": (study.points, "Differences by threshold and criterion, every number.", None),
+        "sensitivity_overview": (study.overview, "How far differences hang on threshold and criterion.", None),
         "cells": (analysis.cells, "Steps to threshold by group.", None),
         "steps_to_threshold": (steps_table(measured), "Steps to threshold of each run.", STEPS_COLUMNS),
     }
@@ -116,6 +119,7 @@ def _write_figures(analysis: Analysis, out: Path, options: argparse.Namespace, w
         planned=analysis.planned,
         curves=learning_curves(measured, data.episodes, data.groups, window),
         speeds=training_speeds(data.root, measured, data.groups),
+        sensitivity=analysis.study.points,
     )
     made: dict[str, Picture] = {}
     for spec, palette, figure in draw_all(drawing):

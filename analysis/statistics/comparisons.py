@@ -30,6 +30,9 @@ _OTHERS = ""
 #: A large effect (Cohen, 1988), for the power.
 LARGE_EFFECT = 0.8
 
+#: Orders of cells that the paper claims and does not test, (reference, index): A2 is to be the best, just before A3.
+UNTESTED = (("A2", "A3"),)
+
 #: Each kind of test, with and without censored runs, and its p-values adjusted within a family.
 _ADJUSTED = {
     "p_value": "p_holm",
@@ -67,12 +70,31 @@ def compare_cells(runs: pd.DataFrame, reference: str = REFERENCE, planned: int =
         One row a cell with ``COLUMNS``, in the paper's order: the target's cells first. With another reference, A0 is
         one of the others.
     """
+    return _compare(runs, cell_pairs(runs, reference), planned)
+
+
+def cell_pairs(runs: pd.DataFrame, reference: str = REFERENCE) -> list[tuple[str, str]]:
+    """What table 3 compares, (reference, index), in the paper's order: the target's cells first."""
     pairs = []
     for cell in sorted(planned_cells(runs["group"]), key=lambda cell: cell.role != TARGET):
         baseline = reference if REFERENCE in (cell.name, cell.baseline) else cell.baseline
-        if baseline not in (None, cell.name):
+        if baseline is not None and baseline != cell.name:
             pairs.append((baseline, cell.name))
-    return _compare(runs, pairs, planned)
+    return pairs
+
+
+def study_pairs(runs: pd.DataFrame, reference: str = REFERENCE, most_others: int = 8) -> list[tuple[str, str]]:
+    """What the study beyond table 3 compares: its pairs, the paper's untested claims, other groups; with runs only.
+
+    Args:
+        runs: The runs with their metrics.
+        reference: Group that stands in A0's place.
+        most_others: Groups that are no cells, at most.
+    """
+    others = sorted(set(runs.loc[runs["cell"].isna(), "group"]) - {reference})[:most_others]
+    pairs = [*cell_pairs(runs, reference), *UNTESTED, *((reference, other) for other in others)]
+    there = set(runs.loc[runs["counted"], "group"])
+    return [pair for pair in pairs if there.issuperset(pair)]
 
 
 def compare_groups(runs: pd.DataFrame, reference: str = REFERENCE, planned: int = 3) -> pd.DataFrame:
@@ -200,6 +222,15 @@ def bias(runs: pd.DataFrame) -> str:
     return next(iter(runs["bias"]), "")
 
 
+def stopped_before(runs: pd.DataFrame) -> pd.Series:
+    """Which runs stopped at a threshold of their own before they met the one that is asked for, (n,) of bool.
+
+    When they would have met it is not known, and that they were not watched any longer has to do with their speed.
+    """
+    limit = runs["stop_after"].fillna(runs["total_timesteps"])
+    return runs["cut"] & runs["censored"] & (runs["state"] == COMPLETE) & (runs["horizon"] < limit)
+
+
 def common_horizon(runs: pd.DataFrame) -> float:
     """Steps up to which all of these runs were watched, or would have been if they had not reached; n >= 1."""
     watched = runs["watched"].min()
@@ -212,9 +243,7 @@ def _notes(name: str, runs: pd.DataFrame, planned: int) -> list[str]:
         return [f"{name}: no complete run"]
     if bias(runs):
         return [bias(runs)]
-    own = runs["stop_after"].fillna(runs["total_timesteps"])
-    early = int((runs["cut"] & runs["censored"] & (runs["state"] == COMPLETE) & (runs["horizon"] < own)).sum())
-    if early:
+    if early := int(stopped_before(runs).sum()):
         notes.append(
             f"{name}: {early} of {n} runs stopped at a threshold of their own before they met this one, and are "
             "censored there, the fast ones soonest: tests take censoring for independent of speed"

@@ -39,6 +39,8 @@ def settle(runs: pd.DataFrame, planned: Iterable[int], profile: str) -> pd.DataF
     for group in dict.fromkeys(runs.loc[runs["counted"] & runs["cut"], "group"]):
         own = runs[runs["group"] == group]
         seeds = sorted({*planned, *(int(seed) for seed in own["seed"].dropna())})
+        if set(seeds) <= set(own.loc[own["counted"], "seed"]):
+            continue  # all have ended
         unknown, first = _unknown(own, seeds), own[own["seed"].isin(PAPER_SEEDS)]
         if unknown and not (first["counted"].any() and _is_whole(first)):
             runs.loc[own.index, "bias"] = _sentence(str(group), own, unknown, profile)

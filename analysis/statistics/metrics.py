@@ -27,6 +27,7 @@ __all__ = [
     "area_under_curve",
     "asymptotic_return",
     "initial_return",
+    "judge",
     "jumpstart",
     "measure",
     "rolling_mean",
@@ -148,7 +149,20 @@ def measure(data: RunSet, threshold: float, consecutive: int) -> pd.DataFrame:
         start = float(starts[str(name)])
         rows[str(name)] = _measure_run(episodes, start, threshold, consecutive)
     measured = pd.DataFrame.from_dict(rows, orient="index", columns=_MEASURES)
-    runs = data.runs.join(measured)
+    return judge(data.runs.join(measured))
+
+
+def judge(runs: pd.DataFrame) -> pd.DataFrame:
+    """Which runs are censored, and up to which step each was watched, by its steps to a threshold, whichever that is.
+
+    Args:
+        runs: The runs with ``steps_to_threshold`` (NaN: not reached) and the measures of a run's end.
+
+    Returns:
+        The frame with ``censored``, ``time``, ``watched`` and ``bias`` (see :func:`measure`), and without the measures
+        of the end of runs that were cut short.
+    """
+    runs = runs.copy()
     runs["censored"] = runs["steps_to_threshold"].isna()
     runs["time"] = runs["steps_to_threshold"].fillna(runs["horizon"].astype(float))
     # Once it has reached the threshold a run needs no more watching: that it ends then, or has come no further yet,
