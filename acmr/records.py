@@ -40,6 +40,10 @@ RUNNING, STOPPED, FAILED = "running", "stopped", "failed"
 #: States of a run that came to its end, as ``status.json`` and ``summary.json`` name them.
 COMPLETE, DIVERGED = "complete", "diverged"
 ENDED = (COMPLETE, DIVERGED)
+#: Entries of ``summary.json``: the size and SHA-256 of each of the files below, and the SHA-256 of all other entries.
+FILES_ENTRY, SEAL_ENTRY = "files", "sha256"
+#: What a finished run is judged by: its settings and its two tables.
+SEALED_FILES = (CONFIG_FILE, EPISODES_FILE, METRICS_FILE)
 #: What other programs call a run that came to its end.
 _FINISHED = ("completed", "finished", "done", "success", "successful", "succeeded", "ended", "ok")
 #: What is said of a run that came to its end before any of its episodes did.

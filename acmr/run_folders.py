@@ -1,16 +1,23 @@
-"""Which directories below a folder hold a run: the one search of the analysis, ``make status`` and ``make publish``.
+"""Which directories below a folder hold a run, and whether a finished one is as it was when it ended.
 
-Standard library only, like :mod:`acmr.records`.
+The one search of the analysis, ``make status`` and ``make publish``. Standard library only, like :mod:`acmr.records`.
 """
 
 from __future__ import annotations
 
+import gzip
+import hashlib
+import json
 import os
+import stat
+import zlib
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, BinaryIO
 
-from acmr.records import EPISODE_FILES, SEED_FOLDER, SUMMARY_FILE
+from acmr.records import EPISODE_FILES, FILES_ENTRY, SEAL_ENTRY, SEALED_FILES, SEED_FOLDER, SUMMARY_FILE
 
 #: Folders that hold other files of the same names (of W&B, Python); those whose name begins with a dot are, too.
 PASSED_OVER = ("wandb", "__pycache__")
@@ -51,6 +58,35 @@ def run_folders(root: Path) -> list[RunFolder]:
         for link in links:
             search.follow(link)
     return sorted(search.found.values(), key=lambda run: run.path)
+
+
+def sealed(summary: Mapping[str, Any], files: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """A summary with what :func:`changes` needs to find out whether anything was changed since.
+
+    Args:
+        summary: What a finished run says of itself.
+        files: ``size`` (bytes) and ``sha256`` (hex) of each of ``SEALED_FILES``.
+    """
+    content = {**summary, FILES_ENTRY: {name: dict(digest) for name, digest in files.items()}}
+    return {**content, SEAL_ENTRY: _seal(content)}
+
+
+def changes(directory: Path, summary: Mapping[str, Any]) -> list[str]:
+    """What of a finished run is not as it was when the run ended, a line each; of older runs nothing is known.
+
+    A table that was compressed since, as ``episodes.csv.gz``, is judged by what it holds.
+
+    Args:
+        directory: The run's.
+        summary: The content of its ``summary.json``.
+    """
+    if FILES_ENTRY not in summary and SEAL_ENTRY not in summary:
+        return []
+    found = [f"{SUMMARY_FILE} was changed since"] if _seal(summary) != summary.get(SEAL_ENTRY) else []
+    files = summary.get(FILES_ENTRY)
+    if not isinstance(files, Mapping) or not set(files) <= set(SEALED_FILES):
+        return found or [f"{SUMMARY_FILE} names files that are none of a run's"]
+    return found + [said for name, digest in files.items() if (said := _change(directory, name, digest))]
 
 
 class _Search:
@@ -120,3 +156,45 @@ def _may_hold_runs(link: os.DirEntry[str]) -> bool:
     with suppress(OSError):
         return link.is_dir() or not os.path.exists(link.path)
     return True
+
+
+def _seal(content: Mapping[str, Any]) -> str:
+    rest = {key: value for key, value in content.items() if key != SEAL_ENTRY}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def _change(directory: Path, name: str, digest: Any) -> str:
+    """What is wrong with a file; empty if nothing is."""
+    size, sha256 = (digest.get("size"), digest.get("sha256")) if isinstance(digest, Mapping) else (None, None)
+    if not isinstance(size, int) or not isinstance(sha256, str):
+        return f"{SUMMARY_FILE} does not say what {name} was"
+    path, packed = directory / name, directory / f"{name}.gz"
+    is_packed = not os.path.lexists(path) and os.path.lexists(packed)
+    try:
+        # Not to wait for the writer of a pipe that somebody has put there.
+        descriptor = os.open(packed if is_packed else path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(descriptor, "rb") as stream:
+            status = os.fstat(descriptor)
+            if not stat.S_ISREG(status.st_mode):
+                return f"{name} is no file"
+            if not is_packed and status.st_size != size:
+                return f"{name} has {status.st_size:,} bytes, not the {size:,} that it had when the run ended"
+            if is_packed:
+                with gzip.open(stream) as content:
+                    same = _sha256(content, size) == sha256
+            else:
+                same = _sha256(stream, size) == sha256
+    except FileNotFoundError:
+        return f"{name} is missing"
+    except (OSError, EOFError, zlib.error) as error:
+        return f"{name} cannot be read ({getattr(error, 'strerror', None) or error})"
+    return "" if same else f"{name} was changed since the run ended"
+
+
+def _sha256(stream: BinaryIO | gzip.GzipFile, size: int) -> str:
+    """The hash of a stream; nothing is read that goes beyond its size by more than a block."""
+    found, left = hashlib.sha256(), size
+    while left >= 0 and (block := stream.read(1 << 20)):
+        found.update(block)
+        left -= len(block)
+    return found.hexdigest()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import gzip
+import hashlib
 import json
 import os
 import subprocess
@@ -28,13 +29,15 @@ from acmr.records import (
     DESCRIPTION_FILE,
     EPISODES_FILE,
     EVALUATION_FILE,
+    FILES_ENTRY,
     METRICS_FILE,
+    SEALED_FILES,
     SUMMARY_FILE,
     TENSOR_FILE,
     TRANSFER_FILE,
     ended_state,
 )
-from acmr.run_folders import run_folders
+from acmr.run_folders import changes, run_folders, sealed
 from acmr.text import size
 
 #: A table above this is compressed; networks above it are published in half precision, unless students learn from them.
@@ -119,13 +122,29 @@ def _files(run: Path, target: Path, scratch: Path) -> dict[str, bytes]:
         raise PublishError(f"{run / SUMMARY_FILE}: cannot be read; move that run away, or make it anew") from None
     if ended_state(summary) is None:
         return {}
+    if changed := changes(run, summary):
+        raise PublishError(f"{run}: {'; '.join(changed)}; put back what the run wrote, or make it anew")
     files = dict(_packed(run / name) for name in RECORDS if (run / name).is_file())
+    files[SUMMARY_FILE] = _resealed(summary, files)
     # The networks of a run that diverged are of no use.
     if ended_state(summary) == COMPLETE and all((run / name).is_file() for name in NETWORKS):
         is_full = _teaches(summary) or (run / TENSOR_FILE).stat().st_size <= LARGE
         source = run if is_full else _halved(run, target, scratch)
         files |= {name: (source / name).read_bytes() for name in NETWORKS}
     return files
+
+
+def _resealed(summary: dict[str, Any], files: dict[str, bytes]) -> bytes:
+    """The summary as it is published: it tells what the published files hold, which may be less than the run's do."""
+    if FILES_ENTRY not in summary:
+        return files[SUMMARY_FILE]
+    digests = {}
+    for name in SEALED_FILES:
+        data = files[name] if name in files else gzip.decompress(files[f"{name}.gz"])
+        digests[name] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    if digests == summary[FILES_ENTRY]:
+        return files[SUMMARY_FILE]
+    return (json.dumps(sealed(summary, digests), indent=2) + "\n").encode()
 
 
 def _teaches(summary: dict[str, Any]) -> bool:

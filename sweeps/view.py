@@ -22,6 +22,7 @@ from acmr.records import (
     ended_state,
     unended_reason,
 )
+from acmr.run_folders import changes
 from acmr.storage.json_files import read_json
 from acmr.storage.processes import is_alive
 from sweeps.folder import FINAL, WAITING, State, SweepRun
@@ -99,6 +100,9 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
     summary = None if state and state.state == RUNNING else read_said(directory / SUMMARY_FILE)
     ended = None if summary is None else ended_state(summary)
     if summary is not None and ended is not None:
+        if changed := changes(directory, read_json(directory / SUMMARY_FILE) or {}):
+            reason = f"it ended, but {'; '.join(changed)}; put back what it wrote, or run it anew with force=true"
+            return RunStatus(name, seed, directory, FAILED, total=total, reason=reason)
         step, speed = int(summary.get("global_step") or 0), float(summary.get("steps_per_second") or 0)
         met, latest = summary.get("steps_to_threshold"), summary.get("final_return")
         total = step if ended == COMPLETE else int(summary.get("total_timesteps") or total)

@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 from functools import reduce
+from hashlib import sha256
 from operator import getitem
 from pathlib import Path
 
@@ -14,7 +15,8 @@ import yaml
 
 from acmr.cells import CELLS, TARGET, run_name
 from acmr.config import STOP_KEYS
-from acmr.records import steps_to_threshold
+from acmr.records import SEALED_FILES, steps_to_threshold
+from acmr.run_folders import sealed
 
 PAIRS = {"paper": ("humanoid", "armless_humanoid"), "quick": ("ant", "ant_three_legs")}
 HEADER = "global_step,episodic_return,episode_length,mean_forward_velocity,reward_forward,reward_survive"
@@ -139,6 +141,15 @@ def write_run(
             "machine": "node-1",
         }
         (directory / "summary.json").write_text(json.dumps(content | (summary if isinstance(summary, dict) else {})))
+    return directory
+
+
+def seal(directory: Path, **more: object) -> Path:
+    """Adds to a finished run what tells later whether its files are what they were, as runs leave it themselves."""
+    path = directory / "summary.json"
+    contents = {name: (directory / name).read_bytes() for name in SEALED_FILES}
+    files = {name: {"size": len(data), "sha256": sha256(data).hexdigest()} for name, data in contents.items()}
+    path.write_text(json.dumps(sealed(json.loads(path.read_text()) | more, files), indent=2) + "\n")
     return directory
 
 

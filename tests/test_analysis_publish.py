@@ -10,10 +10,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from analysis_runs import rows_reaching, run_directory, write_run
+from analysis_runs import rows_reaching, run_directory, seal, write_run
 
+from acmr.run_folders import changes
 from analysis.loading.load import load
-from analysis.publish import PublishError, publish
+from analysis.publish import PublishError, _resealed, publish
 
 
 @pytest.fixture
@@ -91,3 +92,36 @@ def test_nothing_to_publish_is_said_in_one_line(make, tmp_path):
     said = "no run has come to its end there; make status says how far they are"
     assert ended.stderr == f"analysis.publish: {tmp_path / 'runs'}: {said}\n"
     assert not (tmp_path / "out").exists()
+
+
+def test_published_runs_tell_what_their_published_files_hold(runs, tmp_path):
+    # A1's table is compressed; of A0 nothing can be known, as it is older.
+    folders = [seal(run_directory(runs, cell, 1)) for cell in ("H0", "A1")]
+    out = tmp_path / "results"
+    publish(runs, out)
+    assert publish(runs, out).added == []
+    for folder in folders:
+        there = out / folder.relative_to(runs)
+        assert changes(there, json.loads((there / "summary.json").read_text())) == []
+    summary = json.loads((folders[0] / "summary.json").read_text())
+    files = {path.name: path.read_bytes() for path in folders[0].iterdir() if path.is_file()}
+    assert _resealed(summary, files) == files["summary.json"]
+    # Whatever is left out of what is published, the published summary is of that.
+    there = tmp_path / "other"
+    there.mkdir()
+    files["config.yaml"] = files["config.yaml"].replace(b"threads: 1\n", b"")
+    files["summary.json"] = _resealed(summary, files)
+    for name, data in files.items():
+        (there / name).write_bytes(data)
+    assert changes(there, json.loads((there / "summary.json").read_text())) == []
+    assert json.loads(files["summary.json"])["episodes"] == summary["episodes"]
+
+
+@pytest.mark.parametrize("name", ["episodes.csv", "metrics.csv", "config.yaml", "summary.json"])
+def test_a_changed_run_is_not_published(name, runs, tmp_path):
+    folder = seal(run_directory(runs, "A0", 1))
+    path = folder / name
+    path.write_text(path.read_text().replace("1", "2", 1))
+    with pytest.raises(PublishError, match=f"{folder}: {name} was changed since"):
+        publish(runs, tmp_path / "results")
+    assert not (tmp_path / "results").exists()

@@ -25,6 +25,7 @@ from acmr.run import reproducibility, summary, trainer
 from acmr.run.checkpointing import Checkpoints, CheckpointSchedule, make_checkpoints
 from acmr.run.preparation import Prepared, prepare
 from acmr.run.run_state import RunState, make_state
+from acmr.run_folders import changes
 from acmr.settings.compose import compose_config, parse
 from acmr.settings.run_spec import RunSpec, specify
 from acmr.storage import durable
@@ -42,8 +43,8 @@ SHORT = (
     *(word for word in ANT if not word.startswith(("total_timesteps", "env.max_episode_steps", "agent.learning"))),
     "total_timesteps=90", "env.max_episode_steps=25", "agent.learning_starts=50",
 )  # fmt: skip
-#: Entries of summary.json that say how long it took.
-TIMES = ("wall_seconds", "steps_per_second")
+#: Entries of summary.json that say how long it took, and those that follow from these and from where the run lies.
+TIMES = ("wall_seconds", "steps_per_second", "files", "sha256")
 #: Files that say how a run went, not what came of it.
 ASIDE = {"run.log", "status.json", ".lock"}
 
@@ -163,6 +164,8 @@ class Run:
         found = {name: (self.folder / name).read_bytes() for name in sorted(names - ASIDE)}
         found["metrics.csv"] = without_speed(found["metrics.csv"])
         said = json.loads(found["summary.json"])
+        assert set(said["files"]) == {"config.yaml", "episodes.csv", "metrics.csv"}
+        assert changes(self.folder, said) == []
         found["summary.json"] = json.dumps({key: said[key] for key in said if key not in TIMES}).encode()
         found["buffer"] = (self.output / "buffer.sha256").read_bytes()
         # Where it lies is not what it is, but a teacher's own hash is of that, too.

@@ -43,6 +43,7 @@ def load_run(path: Path, trust: bool = False) -> tuple[Teacher, EnvConfig]:
     run_dir = RunDir(path)
     if not path.is_dir():
         raise ConfigError(f"{path}: no such run directory; give one as in runs/quick/ant-none/seed_1")
+    run_dir.check_unchanged()
     settings = run_dir.stored_settings()
     if settings is None:
         raise ConfigError(f"{path}: not a run directory (no {CONFIG_FILE}); give one as in runs/quick/ant-none/seed_1")

@@ -6,6 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -18,6 +19,8 @@ from acmr.run.run_state import RunState, arrays_bytes
 from acmr.run.stop_signals import Stopped, StopSignals
 from acmr.run.trainer import is_finite
 from acmr.storage.checkpoint_store import KEPT, FormatError, Snapshot, SnapshotStore
+from acmr.storage.durable import WriteError
+from acmr.storage.hold import RunHeldError
 from acmr.storage.run_dir import RunDir
 from acmr.tracking.observer import Observer
 
@@ -176,8 +179,10 @@ def make_checkpoints(prepared: Prepared, state: RunState, run_dir: RunDir) -> Ch
 
 
 def discard_checkpoints(run_dir: RunDir) -> None:
-    """Removes the checkpoints of a run that needs them no more."""
-    SnapshotStore(run_dir.checkpoint_folder, 0).clear()
+    """Removes the checkpoints of a finished run that was killed between its last two acts, if nobody else does."""
+    if run_dir.checkpoint_folder.exists():
+        with suppress(RunHeldError, WriteError), run_dir.lock():
+            SnapshotStore(run_dir.checkpoint_folder, 0).clear()
 
 
 def _key(prepared: Prepared) -> CheckpointKey:

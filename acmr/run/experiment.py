@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
@@ -18,8 +18,8 @@ from acmr.run.stop_signals import StopSignals
 from acmr.run.summary import describe_teacher, reached, summarize
 from acmr.run.trainer import DivergedError, FailedError, Trainer
 from acmr.settings.run_spec import RunSpec
-from acmr.storage.durable import StorageError, WriteError
-from acmr.storage.run_dir import RunDir, RunHeldError, holds_run
+from acmr.storage.durable import FileDigest, StorageError, WriteError
+from acmr.storage.run_dir import RunDir, holds_run
 from acmr.text import one_line
 from acmr.tracking.observer import close_all
 from acmr.tracking.watchers import make_watchers
@@ -73,10 +73,7 @@ def _finished(spec: RunSpec, run_dir: RunDir, say: Callable[[str], None]) -> dic
         return summary
     if not run_dir.is_complete() or summary is None:
         return None
-    if run_dir.checkpoint_folder.exists():
-        # It was killed between its last two acts.
-        with suppress(RunHeldError, WriteError), run_dir.lock():
-            discard_checkpoints(run_dir)
+    discard_checkpoints(run_dir)
     say(f"{run_dir}: complete already{reached(summary)}; force=true runs it anew")
     return summary
 
@@ -89,6 +86,7 @@ class Session:
     run_dir: RunDir
     stop: StopSignals
     say: Callable[[str], None]
+    _settings: FileDigest = field(init=False)
 
     def run(self) -> dict[str, Any]:
         """Trains to the end, and stores what came of it."""
@@ -121,6 +119,7 @@ class Session:
             state.logs.begin()
         if not run_dir.transfer_file.exists():
             run_dir.write_json(run_dir.transfer_file, asdict(self.prepared.report))
+        self._settings = run_dir.settings_digest()
 
     def _train(self, checkpoints: Checkpoints, state: RunState) -> dict[str, Any]:
         spec, trainer, run_dir = self.prepared.spec, state.trainer, self.run_dir
@@ -136,8 +135,8 @@ class Session:
                 description = describe_teacher(spec, self.prepared.about, trainer.agent, summary, self.say)
                 save_teacher(run_dir.path, trainer.agent.networks, description)
             # Every row is on the disk before anything says that the run is finished, and a run with a summary is.
-            state.logs.sync()
-            run_dir.write_json(run_dir.summary_file, summary)
+            files = {run_dir.config_file.name: self._settings, **state.logs.digests()}
+            summary = run_dir.finish(summary, files)
         except BaseException:
             # What ended the run matters more than what closing may raise.
             with suppress(Exception):

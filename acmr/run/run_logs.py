@@ -84,6 +84,11 @@ class RunLogs(Observer):
         """Waits until every row is on the disk, and says what each file holds."""
         return {name: log.sync() for name, log in self._logs.items()}
 
+    def digests(self) -> dict[str, FileDigest]:
+        """The same by the files' names, as ``summary.json`` keeps it."""
+        paths = {name: path for name, (path, _) in self._files().items()}
+        return {paths[name].name: digest for name, digest in self.sync().items()}
+
     def close(self, summary: Mapping[str, Any] | None = None) -> None:
         """Closes both files; where they are closed already, does nothing."""
         logs, self._logs = self._logs, {}

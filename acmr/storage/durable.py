@@ -1,5 +1,7 @@
 """Every write that must survive a crash goes through here, one small step at a time, so that tests can fail each step.
 
+Before each step it is looked whether the run's directory is still this process's (:mod:`acmr.storage.hold`).
+
 A file is written whole under another name, reaches the disk, and then takes its name; or it only grows, and what it
 held at some moment is known by length and hash. No link is followed.
 """
@@ -19,6 +21,7 @@ from typing import Any
 
 from acmr.config import ConfigError
 from acmr.records import DamagedError
+from acmr.storage.hold import check_hold
 
 #: Called with an action and a file before each step; a test may raise OSError here, or end the process.
 hook: Callable[[str, Path], None] | None = None
@@ -240,6 +243,7 @@ def _step(action: str, path: Path) -> Iterator[None]:
     try:
         if hook is not None:
             hook(action, path)
+        check_hold(path)
         yield
     except OSError as error:
         raise WriteError(path, error) from error

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from acmr.storage.durable import write_bytes
+from acmr.storage.hold import check_hold
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -25,7 +26,9 @@ def replace_json(path: Path, content: Mapping[str, Any]) -> None:
 
     Raises:
         OSError: If the disk does not take it; the old content is untouched then.
+        LostError: If it lies in the directory of a run that this process no longer holds.
     """
+    check_hold(path)
     # Several processes may write the same file.
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-import platform
-import re
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +33,18 @@ from acmr.records import (
     DamagedError,
     ended_state,
 )
-from acmr.storage.durable import StorageError, read_regular, remove, remove_leftovers, sync_folder, write_bytes
+from acmr.run_folders import changes, sealed
+from acmr.storage.durable import (
+    FileDigest,
+    StorageError,
+    read_regular,
+    remove,
+    remove_leftovers,
+    sync_folder,
+    write_bytes,
+)
+from acmr.storage.hold import LOCK_FILE, LostError, hold
 from acmr.storage.json_files import read_json, replace_json, write_json
-from acmr.storage.processes import is_alive
 from acmr.text import message, one_line
 
 #: Files that a run writes anew when it starts from the beginning; what would make it look finished goes first.
@@ -52,14 +59,6 @@ _RESULTS = (
 )
 #: A settings file or a summary larger than this is not one of ours.
 _MAX_BYTES = 1 << 20
-#: Seconds in which who has just taken a directory must have said so.
-_INTRODUCTION = 5.0
-
-
-class RunHeldError(ConfigError):
-    """Another process is at work on the run."""
-
-    exit_code = 75
 
 
 class RunDir:
@@ -73,7 +72,7 @@ class RunDir:
         self.transfer_file = path / TRANSFER_FILE
         self.summary_file = path / SUMMARY_FILE
         self.log_file = path / LOG_FILE
-        self.lock_file = path / ".lock"
+        self.lock_file = path / LOCK_FILE
         self.checkpoint_folder = path / "checkpoint"
 
     def __str__(self) -> str:
@@ -84,9 +83,32 @@ class RunDir:
         return self.read_json(self.summary_file)
 
     def is_complete(self) -> bool:
-        """Whether the run came to its end."""
+        """Whether the run came to its end, and what it recorded is what it left."""
         summary = self.summary()
-        return summary is not None and ended_state(summary) == COMPLETE
+        return summary is not None and ended_state(summary) == COMPLETE and not changes(self.path, summary)
+
+    def check_unchanged(self) -> None:
+        """Sees that a finished run is what it was when it ended; an unfinished one has nothing to be judged by.
+
+        Raises:
+            ConfigError: If it is not, or its summary cannot be read.
+        """
+        if changed := changes(self.path, self.summary() or {}):
+            raise ConfigError(
+                f"{self.path}: a finished run, but {'; '.join(changed)}; put back what the run wrote, or type "
+                "force=true to run it anew"
+            )
+
+    def settings_digest(self) -> FileDigest:
+        """What ``config.yaml`` holds.
+
+        Raises:
+            ConfigError: If it cannot be read.
+        """
+        try:
+            return FileDigest.of(read_regular(self.config_file, _MAX_BYTES))
+        except DamagedError as error:
+            raise ConfigError(f"{error}; type force=true to run it anew") from error
 
     def stored_settings(self) -> dict[str, Any] | None:
         """The settings it was started with; None if there are none yet."""
@@ -126,6 +148,20 @@ class RunDir:
         """Writes a JSON file whole or not at all."""
         write_json(path, content)
 
+    def finish(self, summary: Mapping[str, Any], files: Mapping[str, FileDigest]) -> dict[str, Any]:
+        """Stores what the run says of itself, by which it is finished.
+
+        Args:
+            summary: The content of ``summary.json``.
+            files: What this process has written of each of ``SEALED_FILES``: whatever lies there by their names.
+
+        Returns:
+            The summary with what tells whether anything is changed from now on.
+        """
+        whole = sealed(summary, {name: asdict(digest) for name, digest in files.items()})
+        self.write_json(self.summary_file, whole)
+        return whole
+
     @contextmanager
     def log(self, say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
         """Says lines to the user, and keeps each in ``run.log`` with its time.
@@ -163,36 +199,22 @@ class RunDir:
         """Holds the directory for this process, and frees it however the process ends.
 
         Raises:
-            RunHeldError: If another process holds it, saying which.
-            ConfigError: If the directory cannot be made.
+            ConfigError: If another process holds it (:class:`~acmr.storage.hold.RunHeldError`), or it cannot be made.
         """
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise self._refused(error) from error
-        descriptor = self._open(self.lock_file, os.O_RDWR)
-        try:
+        with ExitStack() as stack:
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise RunHeldError(f"{self.path}: held by {_holder(descriptor)}; wait for it or end it") from None
-            holder = f"process {os.getpid()} on {platform.node()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n"
-            try:
-                os.ftruncate(descriptor, 0)
-                os.pwrite(descriptor, holder.encode(), 0)
+                stack.enter_context(hold(self.path))
                 remove_leftovers(self.path)
             except OSError as error:
                 raise self._refused(error) from error
             yield
-        finally:
-            os.close(descriptor)
 
     def _note_end(self, state: str, cause: str) -> None:
         path = self.path / STATUS_FILE
         status = read_json(path)
         # What another process said of the run stays true where this one has refused to go on with it.
         if status is not None and status.get("process") == os.getpid():
-            with suppress(OSError):
+            with suppress(OSError, LostError):
                 replace_json(path, status | {"state": state, "cause": cause})
 
     def _open(self, path: Path, flags: int) -> int:
@@ -211,9 +233,12 @@ def holds_run(run_dir: RunDir, config: ExperimentConfig) -> bool:
     """Whether the run that the settings mean has been begun in a directory, and is not to be replaced.
 
     Raises:
-        ConfigError: If the directory holds a run with other settings.
+        ConfigError: If the directory holds a run with other settings, or a finished one that was changed since.
     """
-    stored = None if config.force else run_dir.stored_settings()
+    if config.force:
+        return False
+    run_dir.check_unchanged()
+    stored = run_dir.stored_settings()
     if stored is None:
         return False
     differing = differing_keys(stored, config)
@@ -239,15 +264,3 @@ def _is_there(path: Path) -> bool:
         return os.path.lexists(path)
     except (OSError, ValueError):
         return False
-
-
-def _holder(descriptor: int) -> str:
-    """Who holds a lock; its holder may be about to say so, and what its predecessor said may still stand there."""
-    deadline = time.monotonic() + _INTRODUCTION
-    while time.monotonic() < deadline:
-        said = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
-        match = re.match(r"process ([1-9]\d{0,8}) on (\S+) since", said)
-        if match and is_alive(int(match[1]), match[2]):
-            return said
-        time.sleep(0.02)
-    return "another process"

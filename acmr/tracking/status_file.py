@@ -13,6 +13,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from acmr.records import RUNNING, STATUS_FILE, STOPPED, EpisodeRecord
+from acmr.storage.hold import LostError
 from acmr.storage.json_files import replace_json
 from acmr.tracking.observer import Observer
 
@@ -71,6 +72,7 @@ class StatusFile(Observer):
             "started": round(self._started, 1),
             "updated": round(time.time(), 1),
         }
-        # Where that fails nobody can look at it; that is no reason to stop a training.
-        with suppress(OSError):
+        # Where that fails nobody can look at it. That is no reason to stop a training; the next durable write is one if
+        # the directory is no longer this run's.
+        with suppress(OSError, LostError):
             replace_json(self._path, content)

@@ -37,8 +37,10 @@ def _implied(config: ExperimentConfig, dims: Dimensions) -> Teacher:
         about = describe(source.config.env)
         theirs = Dimensions(len(about.observation_names), len(about.action_names))
         check_body(config.transfer, f"the source environment {source.config.env.name}", theirs, dims)
-    if not RunDir(source.directory).is_complete():
-        state = "is not finished" if RunDir(source.directory).stored_settings() else "does not exist"
+    run_dir = RunDir(source.directory)
+    if not run_dir.is_complete():
+        run_dir.check_unchanged()
+        state = "is not finished" if run_dir.stored_settings() else "does not exist"
         raise ConfigError(
             f"transfer={config.transfer.name}: the teacher's run {source.directory} {state}; "
             f"train it with: {source.command} (or give another one: transfer.teacher=PATH)"
