@@ -6,10 +6,13 @@ so that none of them has to load what the others need.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import PurePosixPath
 from typing import Any
 
 #: Every setting of a run; written first, so that a directory which holds a run has it.
@@ -46,6 +49,8 @@ FILES_ENTRY, SEAL_ENTRY = "files", "sha256"
 SEALED_FILES = (CONFIG_FILE, EPISODES_FILE, METRICS_FILE)
 #: What other programs call a run that came to its end.
 _FINISHED = ("completed", "finished", "done", "success", "successful", "succeeded", "ended", "ok")
+#: How a path begins that says where something lies on one machine; a leading dot or name says less.
+_ON_THIS_MACHINE = re.compile(r"/.|~|\.\./|file://|[A-Za-z]:[\\/]")
 #: What is said of a run that came to its end before any of its episodes did.
 NO_EPISODE = "no episode ended"
 
@@ -82,6 +87,42 @@ def unended_reason(summary: Mapping[str, Any]) -> str:
         return f"{SUMMARY_FILE} says that it is {said}"
     known = ", ".join((*ENDED, RUNNING, STOPPED))
     return f"{SUMMARY_FILE}: status {said[:40]!r} is not known; write one of {known}"
+
+
+def portable(value: Any) -> Any:
+    """A value as it goes to others, who are not to be told where things lie on this machine.
+
+    Of such a path the last name is left, and of a run's directory the one before it, too: ``humanoid-none/seed_1``.
+
+    Args:
+        value: As JSON and YAML hold it; other paths, and all else, stay as they are.
+    """
+    if isinstance(value, Mapping):
+        return {key: portable(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [portable(entry) for entry in value]
+    if not isinstance(value, str) or not _ON_THIS_MACHINE.match(value):
+        return value
+    parts = PurePosixPath(value).parts
+    # The third from the end of a short path may be somebody's home.
+    is_run = len(parts) > 4 and SEED_FOLDER.fullmatch(parts[-1])
+    return "/".join(parts[-2:] if is_run else parts[-1:])
+
+
+def portable_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as they go to others: without paths of this machine, and without what only shows the run.
+
+    Args:
+        settings: All settings of a run, or some.
+    """
+    kept = {key: portable(value) for key, value in settings.items() if key != "tracking"}
+    return kept | {"output_dir": "runs"} if "output_dir" in kept else kept
+
+
+def description_sha256(content: Mapping[str, Any]) -> str:
+    """The hash of all entries of ``teacher.json`` but itself, as it stands in the file."""
+    rest = {name: value for name, value in content.items() if name != "description_sha256"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 class DamagedError(Exception):

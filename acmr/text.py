@@ -3,20 +3,36 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import takewhile
 
 #: Characters of an error's message that are shown; a server's answer or a list of names can fill pages.
 LONGEST_MESSAGE = 400
 #: Columns of a pipe or a file, where nothing has to fit.
 UNLIMITED = 10_000
+#: What stands before the host of an address; a password that is not quoted may hold a slash.
+_USERINFO = re.compile(r"://([^\s/?#]*|[^\s@]*:[^\s@]*)@")
 #: Where a run's name may be parted: before a setting, but not within a number such as 1e-05.
 _PARTS, _SEPARATORS = re.compile(r"(?=-[A-Za-z]|  |/)"), "- /"
 
 
 def message(error: BaseException) -> str:
     """The message of an error on one line, or its type where it has none: ``no such file``."""
-    return " ".join(str(error).split())[:LONGEST_MESSAGE] or type(error).__name__
+    return without_userinfo(" ".join(str(error).split()))[:LONGEST_MESSAGE] or type(error).__name__
+
+
+def holds_userinfo(value: object) -> bool:
+    """Whether a value holds an address with a user or a password, ``http://user:password@host``."""
+    if isinstance(value, Mapping):
+        return any(map(holds_userinfo, (*value, *value.values())))
+    if isinstance(value, list | tuple):
+        return any(map(holds_userinfo, value))
+    return isinstance(value, str) and _USERINFO.search(value) is not None
+
+
+def without_userinfo(text: str) -> str:
+    """A text whose addresses say neither user nor password."""
+    return _USERINFO.sub("://***@", text)
 
 
 def one_line(error: BaseException) -> str:

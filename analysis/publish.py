@@ -35,10 +35,12 @@ from acmr.records import (
     SUMMARY_FILE,
     TENSOR_FILE,
     TRANSFER_FILE,
+    DamagedError,
     ended_state,
 )
 from acmr.run_folders import changes, run_folders, sealed
 from acmr.text import size
+from analysis.portable import portable_file
 
 #: A table above this is compressed; networks above it are published in half precision, unless students learn from them.
 LARGE = 1_000_000
@@ -130,7 +132,7 @@ def _files(run: Path, target: Path, scratch: Path) -> dict[str, bytes]:
     if ended_state(summary) == COMPLETE and all((run / name).is_file() for name in NETWORKS):
         is_full = _teaches(summary) or (run / TENSOR_FILE).stat().st_size <= LARGE
         source = run if is_full else _halved(run, target, scratch)
-        files |= {name: (source / name).read_bytes() for name in NETWORKS}
+        files |= {name: _portable(source / name) for name in NETWORKS}
     return files
 
 
@@ -174,7 +176,7 @@ def _evaluate(run: Path, target: Path, say: Callable[[str], None], left_out: lis
     wanted = {"policy": "deterministic", "seed": FIRST_SEED, "episodes": EPISODES, "sha256": about.get("sha256")}
     own = _json(run / EVALUATION_FILE)
     if "fall_rate" in own and own | wanted == own:
-        _write(path, (run / EVALUATION_FILE).read_bytes())
+        _write(path, _portable(run / EVALUATION_FILE))
         return True
     say(f"evaluating {target}, {EPISODES} episodes")
     # Relative, so that no path of this machine is published.
@@ -221,14 +223,26 @@ def _check_size(out: Path, runs: Path, more: int) -> None:
 
 
 def _packed(path: Path) -> tuple[str, bytes]:
-    data = path.read_bytes()
+    data = _portable(path)
     if path.suffix != ".csv" or len(data) <= LARGE:
         return path.name, data
     return f"{path.name}.gz", gzip.compress(data, mtime=0)
 
 
+def _portable(path: Path) -> bytes:
+    """What is published of a file: nothing that only concerns this machine."""
+    try:
+        return portable_file(path.name, path.read_bytes())
+    except DamagedError as error:
+        raise PublishError(f"{path.parent}: {error}; move that run away, or make it anew") from None
+
+
 def _other(path: Path, data: bytes) -> bool:
-    return path.exists() and path.read_bytes() != data
+    """Whether something else lies there; what earlier versions have published says more of the machine."""
+    try:
+        return path.exists() and portable_file(path.name, path.read_bytes()) != data
+    except DamagedError:
+        return True
 
 
 def _write(path: Path, data: bytes) -> None:

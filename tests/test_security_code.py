@@ -17,11 +17,11 @@ from tracking_tools import RUN, spec
 
 from acmr.config import ConfigError
 from acmr.evaluation.cli import main as evaluation
+from acmr.records import description_sha256
 from acmr.settings.compose import CONFIG_FOLDER, look_in
 from acmr.settings.sources import SWEEPS, Sources
 from acmr.settings.stored import stored_config, stored_environment
 from acmr.tracking.mirror import main as mirror
-from acmr.transfer.description import description_sha256
 from acmr.transfer.statistics import with_statistics
 from acmr.transfer.teacher import load_teacher
 from analysis.figures import stills

@@ -18,7 +18,7 @@ from acmr.config import ConfigError, EnvConfig
 from acmr.evaluation.camera import is_robot, make_camera
 from acmr.evaluation.rollout import MOST_STEPS, Episode, VideoOptions, play, render_mode
 from acmr.evaluation.zero_shot import policy_in
-from acmr.records import CONFIG_FILE, EVALUATION_FILE
+from acmr.records import CONFIG_FILE, EVALUATION_FILE, portable
 from acmr.settings.compose import environment_config
 from acmr.settings.stored import stored_environment
 from acmr.storage.durable import WriteError
@@ -163,7 +163,7 @@ def _evaluate_in(
         )
     content = report(
         episodes,
-        run=str(given.run_dir),
+        run=portable(str(given.run_dir)),
         environment=config.name,
         policy="stochastic" if given.stochastic else "deterministic",
         seed=given.seed,

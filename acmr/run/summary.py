@@ -11,7 +11,7 @@ import numpy as np
 from acmr.agent.learner import Learner
 from acmr.config import THRESHOLD
 from acmr.envs import EnvDescription
-from acmr.records import COMPLETE, DIVERGED, NO_EPISODE, EpisodeRecord, steps_to_threshold
+from acmr.records import COMPLETE, DIVERGED, NO_EPISODE, EpisodeRecord, portable_settings, steps_to_threshold
 from acmr.run.reproducibility import git_commit, machine, versions
 from acmr.run.trainer import DivergedError
 from acmr.settings.run_spec import RunSpec
@@ -98,7 +98,7 @@ def describe_teacher(
         profile=spec.config.profile,
         global_step=summary["global_step"],
         final_return=summary["final_return"],
-        config=json.loads(json.dumps(spec.settings)),
+        config=json.loads(json.dumps(portable_settings(spec.settings))),
         statistics=_statistics(spec, agent, say),
     )
 

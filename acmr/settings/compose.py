@@ -26,6 +26,7 @@ from acmr.config import ConfigError, EnvConfig, ExperimentConfig, TransferRules,
 from acmr.settings.files import read_files_with_care
 from acmr.settings.sources import SWEEPS, Sources
 from acmr.settings.validate import validate
+from acmr.settings.variables import refuse_variables
 
 CONFIG_FOLDER = Path(__file__).resolve().parents[2] / "conf"
 #: Settings that are paths.
@@ -58,6 +59,7 @@ def parse(cfg: DictConfig) -> ExperimentConfig:
     """
     try:
         _refuse_unknown(cfg)
+        refuse_variables(cfg, PATH_KEYS)
         config = OmegaConf.to_object(cfg)
     except (MissingMandatoryValue, InterpolationToMissingValueError) as error:
         # The one knows its own place; the other says the place that it leads to.

@@ -18,7 +18,7 @@ from yaml import YAMLError
 from acmr.config import ConfigError, ExperimentConfig, flatten
 from acmr.settings.compose import groups, launchers, options, setting_keys, sources, unknown_key
 from acmr.settings.files import place_of_key, place_of_text
-from acmr.text import message
+from acmr.text import message, without_userinfo
 
 #: Settings whose entries are free; Hydra adds to them with a plus sign only.
 FREE_KEYS = ("env.kwargs", "agent.options", "transfer.options", "tracking.options")
@@ -32,6 +32,10 @@ def explain(error: BaseException) -> str:
     Args:
         error: One of :data:`USER_ERRORS`.
     """
+    return without_userinfo(_explained(error))
+
+
+def _explained(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _unknown_option(error)
     if isinstance(error, OverrideParseException):
@@ -59,7 +63,7 @@ def explain(error: BaseException) -> str:
             return _wrong_type(match[1], error)
     if not text.strip() and error.__cause__ is not None:
         # Hydra says nothing of what it found in a value.
-        return explain(error.__cause__)
+        return _explained(error.__cause__)
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         return _wrong_value(str(error.full_key), text)
     return text.strip().splitlines()[0] if text.strip() else type(error).__name__

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import asdict
 
 from acmr.config import (
     ACTIVATIONS,
@@ -18,9 +20,16 @@ from acmr.config import (
     ConfigError,
     EnvConfig,
     ExperimentConfig,
+    flatten,
 )
 from acmr.records import MOST_SEED
+from acmr.text import holds_userinfo
 
+#: Settings are stored with the run.
+_NO_USERINFO = (
+    "an address with a user or a password, which would be stored with the run; leave them out "
+    "(a W&B server's key is read from WANDB_API_KEY)"
+)
 #: No machine has more.
 MOST_THREADS = 4096
 
@@ -64,10 +73,32 @@ def validate(config: ExperimentConfig) -> None:
     _one_of("resume", config.resume, (EXACT, INEXACT))
     _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
     _one_of("transfer.impute", config.transfer.impute, IMPUTATIONS)
-    if config.tracking.base_url == "":
-        raise ConfigError("tracking=self_hosted needs the server's address: type tracking.base_url=http://HOST:PORT")
+    check_address("tracking.base_url", config.tracking.base_url)
+    for key, value in flatten(asdict(config)).items():
+        if holds_userinfo(value):
+            raise ConfigError(f"{key}: {_NO_USERINFO}")
     _check_transfer(config)
     _check_stop(config)
+
+
+def check_address(key: str, value: str | None) -> None:
+    """Refuses what is no address of a server, or says more than where it is.
+
+    Args:
+        key: What it is called to the user.
+        value: The address; None: there is none.
+
+    Raises:
+        ConfigError: In a line without the address, which may hold a password.
+    """
+    if value is None:
+        return
+    if value == "":
+        raise ConfigError(f"tracking=self_hosted needs the server's address: type {key}=http://HOST:PORT")
+    if "@" in value:
+        raise ConfigError(f"{key}: {_NO_USERINFO}")
+    if not re.fullmatch(r"https?://[^\s/?#]+(/[^\s?#]*)?", value):
+        raise ConfigError(f"{key}: the address of a server is needed, and nothing else, as in http://HOST:PORT")
 
 
 def check_environment(config: EnvConfig) -> None:

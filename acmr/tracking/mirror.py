@@ -23,6 +23,7 @@ from acmr.records import CONFIG_FILE, SUMMARY_FILE
 from acmr.settings.compose import compose_config, options, parse
 from acmr.settings.run_spec import RunSpec
 from acmr.settings.stored import stored_config
+from acmr.settings.validate import check_address
 from acmr.text import message
 from acmr.tracking.observer import Say
 from acmr.tracking.wandb_backend import linked_mirrors, server_problem, wandb_environment
@@ -140,6 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "no server is named; type make sync BASE_URL=http://HOST:PORT (or add --base-url http://HOST:PORT)"
             )
         else:
+            check_address("--base-url", given.base_url)
             print(f"{sync(given.folder, given.base_url)} runs sent to {given.base_url}")
     except ConfigError as error:
         problems.append(str(error))

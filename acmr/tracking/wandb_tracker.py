@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acmr.config import THRESHOLD, TransferConfig
-from acmr.records import EpisodeRecord
+from acmr.records import EpisodeRecord, portable_settings
 from acmr.settings.run_spec import RunSpec
 from acmr.text import one_line
 from acmr.tracking import wandb_backend
@@ -128,7 +128,7 @@ def _mirror(spec: RunSpec, server: str | None) -> Run:
         "job_type": words["job_type"],
         "tags": sorted({tag[: LONGEST["tag"]] for tag in words["tags"] if tag}),
         # Viewers search the config, not group and job_type.
-        "config": {"run": spec.name, **words, **spec.settings},
+        "config": {"run": spec.name, **words, **portable_settings(spec.settings)},
     }
     run = wandb_backend.start(arguments, folder, server)
     with contextlib.suppress(OSError):

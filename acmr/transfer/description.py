@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from dataclasses import dataclass, fields
@@ -11,6 +10,7 @@ from typing import Any
 
 from acmr.agent.architecture import Architecture, Dimensions
 from acmr.config import ACTIVATIONS, ConfigError
+from acmr.records import description_sha256
 
 FORMAT_VERSION = 2
 #: Version 1 knew no statistics.
@@ -67,7 +67,7 @@ class TeacherDescription:
         profile: Profile of the run.
         global_step: Environment steps it was trained for.
         final_return: Mean return of its last episodes; None if it finished none.
-        config: All settings of the run.
+        config: The settings of the run, without paths of its machine and without what only shows it.
         statistics: What its final policy saw and did; None where that was not recorded.
         sha256: Of the tensor file.
         description_sha256: Of all other entries of this description.
@@ -151,12 +151,6 @@ def _statistics(path: Path, given: Any) -> PolicyStatistics:
     if not isinstance(given, dict) or given.keys() != {entry.name for entry in fields(PolicyStatistics)}:
         raise ConfigError(f"{path}: the entries statistics are not what a teacher description holds")
     return PolicyStatistics(**given)
-
-
-def description_sha256(content: dict[str, Any]) -> str:
-    """The hash of all entries but itself, as it stands in the file."""
-    rest = {name: value for name, value in content.items() if name != "description_sha256"}
-    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def _wrong_entries(about: TeacherDescription) -> list[str]:

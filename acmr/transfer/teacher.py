@@ -18,10 +18,10 @@ from torch import Tensor
 
 from acmr.agent.networks import Networks
 from acmr.config import ConfigError
-from acmr.records import DESCRIPTION_FILE, TENSOR_FILE
+from acmr.records import DESCRIPTION_FILE, TENSOR_FILE, description_sha256
 from acmr.storage.durable import write_bytes
 from acmr.storage.json_files import write_json
-from acmr.transfer.description import FULL, HALF, TeacherDescription, description_sha256, read_description
+from acmr.transfer.description import FULL, HALF, TeacherDescription, read_description
 
 #: Tensor files larger than this are none of ours.
 _MAX_TENSOR_BYTES = 1 << 30
