@@ -36,6 +36,7 @@ class Analysis:
         table3: The paper's comparisons.
         others: The comparisons of groups that are no cells.
         missing: Runs of the matrix that are not there.
+        margin: Steps that count as no difference, for equivalence; None: a share of a full run.
     """
 
     data: RunSet
@@ -47,6 +48,7 @@ class Analysis:
     table3: pd.DataFrame
     others: pd.DataFrame
     missing: list[Missing]
+    margin: float | None = None
 
     @property
     def planned(self) -> int:
@@ -68,7 +70,8 @@ class Analysis:
     @cached_property
     def study(self) -> Study:
         """What stands beyond table 3; it takes seconds, and not everybody who analyzes asks for it."""
-        return study(self.data, self.measured, self.threshold, self.consecutive, self.reference)
+        asked = (self.threshold, self.consecutive, self.reference, self.margin)
+        return study(self.data, self.measured, *asked)
 
     @property
     def comparisons(self) -> pd.DataFrame:
@@ -77,7 +80,11 @@ class Analysis:
 
 
 def analyze(
-    data: RunSet, threshold: float | None = None, consecutive: int | None = None, reference: str = REFERENCE
+    data: RunSet,
+    threshold: float | None = None,
+    consecutive: int | None = None,
+    reference: str = REFERENCE,
+    margin: float | None = None,
 ) -> Analysis:
     """All numbers of a set of runs.
 
@@ -86,6 +93,7 @@ def analyze(
         threshold: Return to reach; None: the runs' own.
         consecutive: Episodes in a row; None: the runs' own.
         reference: Group in A0's place.
+        margin: Steps that count as no difference, for equivalence; None: a share of a full run.
 
     Raises:
         InputError: If the runs differ in their thresholds and none is given, or the reference is not there.
@@ -107,6 +115,7 @@ def analyze(
         table3=compare_cells(measured, reference, planned),
         others=compare_groups(measured, reference, planned),
         missing=missing_runs(data),
+        margin=margin,
     )
 
 

@@ -67,6 +67,12 @@ def _parser() -> argparse.ArgumentParser:
         help=f"cell or group that the others are compared with (default: {REFERENCE})",
     )
     parser.add_argument(
+        "--margin",
+        type=_count,
+        metavar="STEPS",
+        help="difference that counts as none in the tests for equivalence (default: a twentieth of a full run)",
+    )
+    parser.add_argument(
         "--format", type=_formats, metavar="LIST", default=FORMATS, help="file formats of the figures: pdf,png,svg"
     )
     parser.add_argument(

@@ -11,7 +11,7 @@ from acmr.names import terminal
 from analysis.analyze import Analysis, analyze
 from analysis.loading.load import load
 from analysis.loading.missing import matrix_command, missing_runs, planned_seeds, profile_of
-from analysis.report.study import sensitivity_lines
+from analysis.report.study import study_lines
 from analysis.report.terminal import left_out_lines, missing_lines, print_summary, result_lines
 
 
@@ -24,7 +24,7 @@ def run(options: argparse.Namespace) -> int:
         said = [f"{options.runs}: no run with episodes to analyze", *left_out_lines(data.runs), *lines]
         print("\n".join(map(terminal, said)), file=sys.stderr)
         return 1
-    analysis = analyze(data, options.threshold, options.consecutive, options.reference)
+    analysis = analyze(data, options.threshold, options.consecutive, options.reference, options.margin)
     closing = [] if options.summary else _write(analysis, options)
     title = f"Steps to threshold {analysis.threshold:g} ({analysis.consecutive} episodes in a row), {profile_of(data)}"
     print_summary(analysis.cells, analysis.comparisons, title)
@@ -37,8 +37,7 @@ def run(options: argparse.Namespace) -> int:
 
 def print_study(analysis: Analysis) -> None:
     """Prints what stands beyond table 3."""
-    parts = {"Sensitivity to threshold and criterion": sensitivity_lines(analysis.study.overview)}
-    for title, lines in parts.items():
+    for title, lines in study_lines(analysis.study).items():
         print("\n".join(map(terminal, ["", title, *(f"  {line}" for line in lines)])))
 
 

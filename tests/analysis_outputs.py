@@ -6,5 +6,6 @@ FIGURES = {
 }
 TABLES = {
     *("table1", "table2", "table3", "published_table3", "cells", "transfer", "steps_to_threshold", "comparisons"),
-    *("sensitivity", "sensitivity_points", "sensitivity_overview"),
+    *("sensitivity", "sensitivity_points", "sensitivity_overview", "paired", "blocks"),
+    *("equivalence", "aggregates", "improvement", "cost"),
 }

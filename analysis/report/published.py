@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Mapping
 from importlib import resources
 from typing import Any
 
 import pandas as pd
 
-from analysis.statistics.two_samples import ALPHA
+from analysis.statistics.study.replication import predicted_effect, published_effect, verdict
 
 
 def published_table3() -> pd.DataFrame:
@@ -18,15 +19,23 @@ def published_table3() -> pd.DataFrame:
         return pd.read_csv(text)
 
 
+_COLUMNS = [
+    *("reference", "index", "t_published", "t_ours", "p_published", "p_ours", "sign"),
+    *("g_published", "g_published_low", "g_published_high", "g_predicted_low", "g_predicted_high"),
+    *("g_ours", "g_ours_low", "g_ours_high", "replicates", "remark"),
+]
+
+
 def side_by_side(table3: pd.DataFrame) -> pd.DataFrame:
-    """Sets our table 3 next to the published one.
+    """Sets our table 3 next to the published one, as effects and not by which of them are significant.
 
     Args:
         table3: Ours (:func:`analysis.statistics.comparisons.compare_cells`).
 
     Returns:
-        One row for each published one: both t and p, ``sign`` and ``significance`` (``agrees``, ``differs`` or ``-``
-        where one of them has none), and a ``remark``.
+        One row for each published one: both t and p; ``sign`` (``agrees``, ``differs`` or ``-`` where one of them has
+        none); the published effect with its interval, where ours has to be expected by it, and ours; ``replicates``
+        (``inside`` or ``outside`` of what had to be expected); and a ``remark``.
     """
     ours = {(row["reference"], row["index"]): row for row in table3.to_dict("records")}
     rows = []
@@ -34,45 +43,51 @@ def side_by_side(table3: pd.DataFrame) -> pd.DataFrame:
         key = (printed["reference"], printed["index"])
         if key not in ours:
             continue
-        row = ours[key]
-        sign, significance, remark = _agreement(printed["t_score"], printed["p_value"], row)
-        rows.append(
-            {
-                "reference": key[0],
-                "index": key[1],
-                "t_published": printed["t_score"],
-                "t_ours": row["t_score"],
-                "p_published": printed["p_value"],
-                "p_ours": row["p_value"],
-                "sign": sign,
-                "significance": significance,
-                "remark": remark,
-            }
-        )
-    columns = ["reference", "index", "t_published", "t_ours", "p_published", "p_ours", "sign", "significance", "remark"]
-    return pd.DataFrame(rows, columns=columns)
+        row, t = ours[key], float(printed["t_score"])
+        sign, remark = _agreement(t, row)
+        tests = {
+            "t_published": t,
+            "t_ours": row["t_score"],
+            "p_published": printed["p_value"],
+            "p_ours": row["p_value"],
+        }
+        names = {"reference": key[0], "index": key[1]}
+        rows.append(names | tests | {"sign": sign} | _effects(t, row) | {"remark": remark})
+    return pd.DataFrame(rows, columns=_COLUMNS)
 
 
-def _agreement(t: float, p: float, ours: Mapping[Hashable, Any]) -> tuple[str, str, str]:
+def _effects(t: float, ours: Mapping[Hashable, Any]) -> dict[str, Any]:
+    published, predicted = published_effect(t), predicted_effect(t, int(ours["n_reference"]), int(ours["n_index"]))
+    g = ours["hedges_g"]
+    return {
+        "g_published": published.g,
+        "g_published_low": published.low,
+        "g_published_high": published.high,
+        # Means of the runs that reached alone are not what was predicted.
+        "g_predicted_low": predicted.low if math.isfinite(g) else math.nan,
+        "g_predicted_high": predicted.high if math.isfinite(g) else math.nan,
+        "g_ours": g,
+        "g_ours_low": ours["hedges_g_low"],
+        "g_ours_high": ours["hedges_g_high"],
+        "replicates": verdict(g, predicted),
+    }
+
+
+def _agreement(t: float, ours: Mapping[Hashable, Any]) -> tuple[str, str]:
     if min(ours["runs_reference"], ours["runs_index"]) == 0:
-        return "-", "-", "not run yet"
+        return "-", "not run yet"
     if ours["biased_reference"] or ours["biased_index"]:
-        return "-", "-", "biased: only its fast runs have ended"
+        return "-", "biased: only its fast runs have ended"
     if pd.isna(t):
         reached, runs = ours["n_index"], ours["runs_index"]
         if not reached:
-            return "agrees", "agrees", f"{ours['index']} never reaches the threshold, in either"
+            return "agrees", f"{ours['index']} never reaches the threshold, in either"
         # Never to reach is to be slower than all that do; what ours lost within its horizon tells the same of us.
         sign = "agrees" if ours["restricted_difference"] > 0 else "differs"
-        return sign, "-", f"{ours['index']} never reached the threshold in the paper; here {reached} of {runs} runs did"
+        return sign, f"{ours['index']} never reached the threshold in the paper; here {reached} of {runs} runs did"
     if pd.isna(ours["t_score"]):
-        return "-", "-", _without_test(ours)
-    verdicts = ["agrees" if same else "differs" for same in ((t < 0) == (ours["t_score"] < 0), _same_level(p, ours))]
-    return verdicts[0], verdicts[1], ""
-
-
-def _same_level(p: float, ours: Mapping[Hashable, Any]) -> bool:
-    return bool((p < ALPHA) == (ours["p_value"] < ALPHA))
+        return "-", _without_test(ours)
+    return "agrees" if (t < 0) == (ours["t_score"] < 0) else "differs", ""
 
 
 def _without_test(ours: Mapping[Hashable, Any]) -> str:

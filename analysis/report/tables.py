@@ -26,10 +26,13 @@ WIDE = 6
 #: Letters of a cell beyond which LaTeX breaks its lines.
 SENTENCE = 30
 
-_COUNTS = ("n_", "runs", "censored", "seed", "episodes", "reached")
+_COUNTS = (
+    *("n_", "runs", "censored", "seed", "episodes", "reached", "pairs", "unpaired", "shared", "full_", "df_"),
+    *("faster", "slower", "undecided", "students"),
+)
 _STEPS = (
     *("mean_", "std_", "difference", "restricted_", "steps", "low", "high", "horizon", "last_step", "mean", "std"),
-    *("asked",),
+    *("asked", "margin", "least_margin", "paired_", "own_", "teacher_", "total_", "baseline_", "saved_", "iqm_"),
 )
 
 
@@ -207,6 +210,22 @@ _WORDS = {
     "power_large_effect": "power for 0.8 SD",
     "detectable_effect": "effect found in 80% (SD)",
     "area_under_curve": "mean return (area)",
+    "p_paired": "P (paired t)",
+    "p_paired_holm": "P (paired t, Holm)",
+    "p_sign_flip": "P (signs)",
+    "p_sign_flip_holm": "P (signs, Holm)",
+    "f_score": "F",
+    "p_friedman": "P (Friedman, asymptotic)",
+    "p_tost": "P (TOST)",
+    "p_tost_paired": "P (TOST, paired)",
+    "paired_low": "paired, from",
+    "paired_high": "paired, to",
+    "p_faster": "P(index faster)",
+    "p_faster_low": "P(index faster), 95% from",
+    "p_faster_high": "P(index faster), 95% to",
+    "p_higher_return": "P(higher return)",
+    "p_higher_return_low": "P(higher return), 95% from",
+    "p_higher_return_high": "P(higher return), 95% to",
 }
 
 

@@ -20,6 +20,7 @@ from analysis.figures.paper import FIGURES, draw_all, picture, save
 from analysis.figures.style import apply
 from analysis.report.html import Picture, Report, data_uri, write_report
 from analysis.report.published import side_by_side
+from analysis.report.study import PAIRED_COLUMNS
 from analysis.report.tables import STEPS_COLUMNS, paper_columns, write_table
 from analysis.statistics.summaries import scores, steps_table, table1, table2, transfer_table
 
@@ -84,6 +85,12 @@ def _write_tables(analysis: Analysis, out: Path, written: Written) -> dict[str, 
         "sensitivity": (study.sensitivity, "Differences by threshold and criterion.", None),
         "sensitivity_points": (study.points, "Differences by threshold and criterion, every number.", None),
         "sensitivity_overview": (study.overview, "How far differences hang on threshold and criterion.", None),
+        "paired": (study.paired, "Comparisons by seed.", PAIRED_COLUMNS),
+        "blocks": (study.blocks, "All cells of a family, seeds being blocks.", None),
+        "equivalence": (study.equivalence, "Two one-sided tests for equivalence.", None),
+        "aggregates": (study.aggregates, "Interquartile means.", None),
+        "improvement": (study.improvement, "Probability of improvement.", None),
+        "cost": (study.cost, "Steps with those of the teacher, and without.", None),
         "cells": (analysis.cells, "Steps to threshold by group.", None),
         "steps_to_threshold": (steps_table(measured), "Steps to threshold of each run.", STEPS_COLUMNS),
     }

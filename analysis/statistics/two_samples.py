@@ -141,14 +141,21 @@ def hedges_g(reference: ArrayLike, index: ArrayLike) -> Effect:
         index: Sample of the index, (m,).
     """
     first, second = _samples(reference, index)
-    test = t_test(first, second)
-    if not math.isfinite(test.t):
+    return effect_of_t(t_test(first, second).t, first.size, second.size)
+
+
+def effect_of_t(t: float, n: int, m: int) -> Effect:
+    """The effect behind Student's t of n + m values (:func:`hedges_g`); NaN if t is not finite."""
+    if not math.isfinite(t):
         return Effect()
-    half = test.df / 2
-    correction = math.exp(special.gammaln(half) - special.gammaln(half - 0.5)) / math.sqrt(half)
-    scale = math.sqrt(1 / first.size + 1 / second.size)
-    ends = (noncentrality(test.t, test.df, 1 - ALPHA / 2), noncentrality(test.t, test.df, ALPHA / 2))
-    return Effect(correction * test.t * scale, ends[0] * scale, ends[1] * scale)
+    df, scale = n + m - 2, math.sqrt(1 / n + 1 / m)
+    ends = (noncentrality(t, df, 1 - ALPHA / 2), noncentrality(t, df, ALPHA / 2))
+    return Effect(small_sample_correction(df) * t * scale, ends[0] * scale, ends[1] * scale)
+
+
+def small_sample_correction(df: float) -> float:
+    """Hedges' J, by which a standardized difference overstates its true value on average."""
+    return math.exp(special.gammaln(df / 2) - special.gammaln((df - 1) / 2)) / math.sqrt(df / 2)
 
 
 def noncentrality(t: float, df: float, probability: float) -> float:
