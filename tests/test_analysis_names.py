@@ -115,7 +115,7 @@ class Page(HTMLParser):
         self.text += data
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_names_of_every_kind_go_through_the_whole_analysis(tmp_path, capsys, recwarn, seed):
     root, out = tmp_path / "runs", tmp_path / "results"
     names = names_of(seed)

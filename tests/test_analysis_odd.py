@@ -132,6 +132,7 @@ def test_an_odd_run_decides_neither_threshold_nor_profile(root, capsys):
     check(root, "no column global_step", capsys)
 
 
+@pytest.mark.slow
 def test_a_report_is_made_of_any_of_them(root, tmp_path, capsys):
     for number, (key, (value, _)) in enumerate(SUMMARY.items(), start=10):
         write_run(root, "A1", number, ROWS, total=20_000, summary={key: value})

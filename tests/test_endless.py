@@ -86,6 +86,7 @@ def test_an_evaluation_cuts_endless_episodes_off(
     assert lengths == [70, 70]
 
 
+@pytest.mark.slow
 def test_a_sweep_s_last_line_says_it(tmp_path: Path) -> None:
     module = "import gymnasium\nfrom gymnasium.envs.classic_control import PendulumEnv\n"
     (tmp_path / "endless.py").write_text(f"{module}gymnasium.register('Endless-v0', PendulumEnv)\n")

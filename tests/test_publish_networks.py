@@ -104,6 +104,7 @@ def test_each_policy_is_evaluated_as_it_is_published(done):
     assert not (published(out, "A3") / "evaluation.json").exists()
 
 
+@pytest.mark.slow
 def test_what_is_there_is_neither_made_again_nor_touched(runs, tmp_path):
     out, said = tmp_path / "results" / "quick", []
     publish(runs, out)
@@ -172,6 +173,7 @@ def test_what_would_be_too_large_for_a_clone_is_refused_before_anything_is_writt
     assert len(publish(published(runs, "A1").parent, out).added) == 1
 
 
+@pytest.mark.slow
 def test_networks_that_cannot_be_evaluated_are_named_and_the_rest_is_published(runs, tmp_path, capsys, monkeypatch):
     path = published(runs, "A1") / "teacher.safetensors"
     path.write_bytes(path.read_bytes()[:-1] + b"x")

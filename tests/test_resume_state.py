@@ -136,6 +136,7 @@ def test_a_part_that_is_added_goes_on_where_it_was(tmp_path):
     assert len(wanted) == 300
 
 
+@pytest.mark.slow
 def test_the_guide_does_what_it_says(tmp_path):
     folder = copy_checkout(tmp_path / "checkout")
     said = follow(GUIDE, folder)

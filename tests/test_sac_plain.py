@@ -130,6 +130,7 @@ def test_what_no_learner_can_is_refused_in_one_line(changes, says):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_the_guide_to_a_loss_of_ones_own(tmp_path):
     said = follow(ROOT / "docs" / "howto-loss.md", copy_checkout(tmp_path / "checkout"))
     assert said.count("complete, ") == 2

@@ -139,6 +139,7 @@ def priorities(folder: Path) -> set[int]:
     return found
 
 
+@pytest.mark.slow
 def test_the_guide_makes_a_launcher_that_steps_back(tmp_path):
     guide, root = ROOT / "docs" / "howto-launcher.md", copy_checkout(tmp_path / "copy")
     seen = set()

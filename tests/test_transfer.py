@@ -211,6 +211,7 @@ def test_a_new_method_is_one_function(teacher_factory, monkeypatch):
     assert not networks.critic_1.output.weight.requires_grad
 
 
+@pytest.mark.slow
 def test_the_guide_to_a_method_of_ones_own(tmp_path):
     said = follow(ROOT / "docs" / "howto-transfer.md", copy_checkout(tmp_path / "checkout"))
     report, _ = json.JSONDecoder().raw_decode(said[said.index("{") :])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,13 +44,7 @@ class FileConfigSource(file_config_source.FileConfigSource):
         Raises:
             ConfigError: If it is no settings file.
         """
-        try:
-            result = super().load_config(config_path)
-        except ConfigLoadError:
-            raise
-        except _WRONG as error:
-            raise ConfigError(f"{shown(self, config_path)}: {_wrong(_file(self, config_path), error)}") from error
-        return _checked(self, config_path, result)
+        return _careful(self, config_path, super().load_config)
 
 
 class ImportlibResourcesConfigSource(importlib_resources_config_source.ImportlibResourcesConfigSource):
@@ -61,13 +56,18 @@ class ImportlibResourcesConfigSource(importlib_resources_config_source.Importlib
         Raises:
             ConfigError: If it is no settings file.
         """
-        try:
-            result = super().load_config(config_path)
-        except ConfigLoadError:
-            raise
-        except _WRONG as error:
-            raise ConfigError(f"{shown(self, config_path)}: {_wrong(None, error)}") from error
-        return _checked(self, config_path, result)
+        return _careful(self, config_path, super().load_config)
+
+
+def _careful(source: ConfigSource, name: str, load: Callable[[str], ConfigResult]) -> ConfigResult:
+    try:
+        result = load(name)
+    except ConfigLoadError:
+        # Of a name that is not there: Hydra goes on to look elsewhere.
+        raise
+    except _WRONG as error:
+        raise ConfigError(f"{shown(source, name)}: {_wrong(_file(source, name), error)}") from error
+    return _checked(source, name, result)
 
 
 def _file(source: ConfigSource, name: str) -> Path | None:
