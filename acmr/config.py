@@ -6,6 +6,7 @@ Values live in ``conf/``; this module gives them types. Nothing here knows where
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -32,8 +33,17 @@ RANDOM, POLICY = "random", "policy"
 EXACT, INEXACT = "exact", "inexact"
 ACTIVATIONS = ("relu", "none")
 #: What a sensor or an actuator that is gone counts as in the networks that knew it (``transfer=named``).
-MEAN, ZERO, INITIAL = "mean", "zero", "initial"
-IMPUTATIONS = (MEAN, ZERO, INITIAL)
+MEAN, ZERO, INITIAL, AUTO = "mean", "zero", "initial", "auto"
+IMPUTATIONS = (AUTO, MEAN, ZERO, INITIAL)
+
+
+def share_of_mean(rule: str) -> float | None:
+    """The share of the mean that a rule of ``transfer.impute`` asks for; None for ``initial``, ``auto`` and others."""
+    try:
+        share = {MEAN: 1.0, ZERO: 0.0}[rule] if rule in (MEAN, ZERO) else float(rule)
+    except ValueError:
+        return None
+    return share if math.isfinite(share) else None
 
 
 class ConfigError(ValueError):
@@ -99,6 +109,15 @@ class SACConfig:
     alpha: float = 0.2
     #: Of matrix products: float32 or bfloat16. Weights and optimizers are in float32 either way.
     precision: str = PRECISIONS[0]
+    #: Updates over which each learning rate rises from zero; 0: it is there at once. This setting and the next three
+    #: are for students that have something to lose (acmr/agent/fine_tuning.py).
+    warmup: int = 0
+    #: Updates that the critics make before the actor's first.
+    critics_first: int = 0
+    #: Weight of the penalty on the distance between the policy and the one that was transferred, at first.
+    kickstart: float = 0.0
+    #: Updates of the actor over which that weight fades to zero.
+    kickstart_updates: int = 60_000
     #: Free room for the settings of learners that are added.
     options: dict[str, Any] = field(default_factory=dict)
 
@@ -149,9 +168,10 @@ class TransferConfig:
     #: Sensors and actuators that the student calls otherwise than the teacher, each as ``old:new`` (``named`` only);
     #: on the command line ``transfer.rename={old: new}``.
     rename: list[str] = field(default_factory=list)
-    #: What those count as that the student has not (``named`` only): their mean under the teacher's policy, zero, or
-    #: their mean at the start of an episode.
-    impute: str = MEAN
+    #: What those count as that the student has not (``named`` only): ``mean`` under the teacher's policy, a share of
+    #: it such as ``0.75``, ``zero``, or ``initial``, their mean at the start of an episode. ``auto`` tries some of
+    #: these in the first episodes, and keeps the best.
+    impute: str = AUTO
     #: Free room for the settings of methods that are added.
     options: dict[str, Any] = field(default_factory=dict)
 

@@ -40,8 +40,9 @@ def take(
     high = np.full(len(actuators), bound, np.float32)
     architecture = Architecture.plain(Dimensions(len(sensors), len(actuators)), SIZES, -high, high)
     student = Student(Networks(architecture, torch.Generator().manual_seed(1)), sensors, actuators)
-    config = replace(TransferConfig(name="named", rules=TransferRules(statistics=True)), **settings)
-    return transfer(student, teacher, config, False, torch.Generator().manual_seed(2))
+    config = replace(TransferConfig(name="named", rules=TransferRules(statistics=True), impute="mean"), **settings)
+    made = transfer(student, teacher, config, False, torch.Generator().manual_seed(2))
+    return made.networks, made.report
 
 
 def outputs(networks: Networks, observations: torch.Tensor, actions: torch.Tensor) -> list[torch.Tensor]:
@@ -82,9 +83,18 @@ def test_what_is_only_added_changes_nothing_at_the_first_step(teacher: Teacher) 
 
 
 @pytest.mark.parametrize(
-    ("impute", "sensed", "done"), [("mean", MEANS, 0.1), ("zero", [0.0] * 12, 0.0), ("initial", [0.5] * 12, 0.1)]
+    ("impute", "sensed", "done", "said"),
+    [
+        ("mean", MEANS, 0.1, "its mean under the teacher's policy"),
+        ("zero", [0.0] * 12, 0.0, "zero"),
+        ("initial", [0.5] * 12, 0.1, "its mean at the start of an episode"),
+        ("0.75", [0.75 * mean for mean in MEANS], 0.075, "0.75 of its mean under the teacher's policy"),
+        ("-2", [-2.0 * mean for mean in MEANS], -0.2, "-2 of its mean under the teacher's policy"),
+    ],
 )
-def test_what_is_gone_counts_as_a_constant(teacher: Teacher, impute: str, sensed: list[float], done: float) -> None:
+def test_what_is_gone_counts_as_a_constant(
+    teacher: Teacher, impute: str, sensed: list[float], done: float, said: str
+) -> None:
     left, motors = [0, 2, 3, 7, 11], [1, 4]
     networks, report = take(teacher, [SENSORS[row] for row in left], [ACTUATORS[row] for row in motors], impute=impute)
     constant = torch.tensor(sensed).repeat(64, 1)
@@ -96,7 +106,7 @@ def test_what_is_gone_counts_as_a_constant(teacher: Teacher, impute: str, sensed
     for ours, theirs in zip(found, (*(part[:, motors] for part in wanted[:2]), *wanted[2:]), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
     assert report.notes == ["5 of 12 sensors kept, 7 gone, 0 added", "2 of 5 actuators kept, 3 gone, 0 added",
-                            f"what is gone is given its {impute}"]  # fmt: skip
+                            f"what is gone counts as {said}"]  # fmt: skip
 
 
 def test_the_critics_see_the_same_share_of_other_bounds(teacher: Teacher) -> None:

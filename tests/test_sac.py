@@ -112,8 +112,8 @@ def student(method: str, freeze: bool, teacher_factory) -> tuple[Networks, list[
     dims = DIMS if method == "direct" else TEACHER_DIMS
     teacher = None if method == "none" else teacher_factory(dims, (16, 12))
     taker = Student(fresh(5), [], [])
-    networks, report = transfer(taker, teacher, TransferConfig(name=method), freeze, generator(6))
-    return networks, report.frozen
+    made = transfer(taker, teacher, TransferConfig(name=method), freeze, generator(6))
+    return made.networks, made.report.frozen
 
 
 @pytest.mark.parametrize(("method", "freeze"), CONFIGURATIONS)

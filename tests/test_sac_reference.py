@@ -71,8 +71,7 @@ def make_networks(cell: str, sizes: tuple[int, ...], teacher_factory: Callable, 
     fresh = Networks(Architecture.plain(dims, sizes, -high, high), generator(5))
     teacher = None if method == "none" else teacher_factory(SOURCE, sizes)
     config = TransferConfig(name=method, adapter_activation=activation)
-    networks, _ = transfer(Student(fresh, [], []), teacher, config, freeze, generator(6))
-    return networks
+    return transfer(Student(fresh, [], []), teacher, config, freeze, generator(6)).networks
 
 
 def assert_same_course(make: Callable[[], Networks], config: SACConfig, updates: int = UPDATES) -> None:

@@ -53,7 +53,8 @@ def run(dims, teacher, name, freeze=False, sizes=SIZES, **options):
         [f"obs/{row}" for row in range(dims.observation)],
         [f"action/{row}" for row in range(dims.action)],
     )
-    return transfer(taker, teacher, config, freeze, torch.Generator().manual_seed(2))
+    made = transfer(taker, teacher, config, freeze, torch.Generator().manual_seed(2))
+    return made.networks, made.report
 
 
 @pytest.mark.parametrize(

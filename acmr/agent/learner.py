@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -51,6 +51,9 @@ class Learner(Protocol):
 
     def update(self, batch: Batch, global_step: int) -> None:
         """Learns from one batch what falls due at this environment step."""
+
+    def set_biases(self, biases: Mapping[str, Tensor]) -> None:
+        """Begins with these biases of layers, by the layers' names, in networks and targets; before any update."""
 
     def metrics(self) -> dict[str, float]:
         """Means over the updates since the last call, by :data:`METRIC_NAMES`; NaN where there were none."""

@@ -97,12 +97,17 @@ class Actor(Trunk):
         self.register_buffer("action_scale", (high - low) / 2.0, persistent=False)
         self.register_buffer("action_bias", (high + low) / 2.0, persistent=False)
 
-    def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log standard deviation before squashing, each (batch, action)."""
+    def outputs(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """What the heads say: the mean, and the log standard deviation before it is bounded, each (batch, action)."""
         hidden = self.features(observations)
         mean, raw = self.mean(hidden), self.log_std(hidden)
         if self.mean_adapter is not None and self.log_std_adapter is not None:
             mean, raw = self.mean_adapter(mean), self.log_std_adapter(raw)
+        return mean, raw
+
+    def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log standard deviation before squashing, each (batch, action)."""
+        mean, raw = self.outputs(observations)
         return mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(raw) + 1.0)
 
     def sample(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

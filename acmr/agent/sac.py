@@ -9,19 +9,22 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from acmr.agent.kernels.arrays import array_of, math_of, tensor_of
+from acmr.agent.fine_tuning import actor_learns, kickstart_weight, rate_share, set_biases
+from acmr.agent.kernels.arrays import Array, array_of, math_of, tensor_of
+from acmr.agent.kernels.groups import actor_groups, critic_groups, heads, relus
 from acmr.agent.kernels.layers import CriticStack, Stack, columns
-from acmr.agent.kernels.parameters import Adam, FlatParameters, Group
+from acmr.agent.kernels.origin import Origin
+from acmr.agent.kernels.parameters import Adam, FlatParameters
 from acmr.agent.kernels.policy import NumpyPolicy, Sample, SquashedGaussian
 from acmr.agent.learner import Means, learner, load_tensors
-from acmr.agent.networks import Actor, Critic, Networks, Trunk
+from acmr.agent.networks import Critic, Networks
 from acmr.agent.replay_buffer import Batch, JoinedBatch
 from acmr.config import PRECISIONS, SACConfig
 
@@ -78,18 +81,21 @@ class SAC:
         # Twin layers lie side by side in memory and learn as one block (:class:`FlatParameters`); the order is that of
         # their application.
         self._reduced = self.config.precision == "bfloat16"
-        low_actor, low_critics = ([self._reduced and not head for head in _heads(net)] for net in (actor, critics[0]))
-        self._actor_parameters = FlatParameters(_actor_groups(actor), reduced=low_actor)
-        self._critic_parameters = FlatParameters(_critic_groups(critics), reduced=low_critics)
-        target_groups = _critic_groups([target for target in self.targets if isinstance(target, Critic)])
+        low_actor, low_critics = ([self._reduced and not head for head in heads(net)] for net in (actor, critics[0]))
+        self._actor_parameters = FlatParameters(actor_groups(actor), reduced=low_actor)
+        self._critic_parameters = FlatParameters(critic_groups(critics), reduced=low_critics)
+        target_groups = critic_groups([target for target in self.targets if isinstance(target, Critic)])
         self._target_parameters = FlatParameters(target_groups, self._critic_parameters, low_critics)
-        relus = _relus(critics[0])
-        self._actor = Stack(self._actor_parameters.blocks, _relus(actor))
-        self._critics = CriticStack(self._critic_parameters.blocks, relus, dims.observation)
-        self._targets = CriticStack(self._target_parameters.blocks, relus, dims.observation)
+        # Whom the actor is held to at first: the policy as it was transferred.
+        held = self.config.kickstart > 0
+        self._origin = Origin(actor, low_actor) if held else None
+        active = relus(critics[0])
+        self._actor = Stack(self._actor_parameters.blocks, relus(actor))
+        self._critics = CriticStack(self._critic_parameters.blocks, active, dims.observation)
+        self._targets = CriticStack(self._target_parameters.blocks, active, dims.observation)
         self._policy = SquashedGaussian(actor.action_scale, actor.action_bias)
         in_numpy = self._math is np
-        acting = Stack(self._actor_parameters.masters, _relus(actor)).layers
+        acting = Stack(self._actor_parameters.masters, relus(actor)).layers
         self._acting = NumpyPolicy(acting, actor.action_scale, actor.action_bias) if in_numpy else None
 
     @torch.no_grad()
@@ -116,12 +122,17 @@ class SAC:
         if len(joined.rewards) != self._batch_size:
             self._allocate(len(joined.rewards))
         self._update_critics(joined)
-        if global_step % self.config.policy_frequency == 0:
+        if global_step % self.config.policy_frequency == 0 and self._actor_learns:
             self._update_actor_and_temperature(joined.observations)
         if global_step % self.config.target_network_frequency == 0:
             # lerp leaves equal values bitwise equal; frozen layers are no part of these vectors.
             self._target_parameters.trainable.lerp_(self._critic_parameters.trainable, self.config.tau)
             self._target_parameters.refresh()
+
+    def set_biases(self, biases: Mapping[str, Tensor]) -> None:
+        """Begins with these biases of layers, by the layers' names, in networks and targets; before any update."""
+        set_biases(self.networks, self.targets, self._origin.actor if self._origin else None, biases)
+        self._refresh()
 
     def metrics(self) -> dict[str, float]:
         """Means over the updates since the last call; NaN where there were none."""
@@ -142,11 +153,16 @@ class SAC:
             ValueError: If the state is of another agent: names or sizes differ.
         """
         load_tensors(self._state_tensors(), state["tensors"])
-        for parameters in (self._actor_parameters, self._critic_parameters, self._target_parameters):
-            parameters.refresh()
+        self._refresh()
         for name, generator in self._generators.items():
             generator.set_state(state["generators"][name])
         self._means.load_state_dict(state)
+
+    def _refresh(self) -> None:
+        for parameters in (self._actor_parameters, self._critic_parameters, self._target_parameters):
+            parameters.refresh()
+        if self._origin is not None:
+            self._origin.parameters.refresh()
 
     def _state_tensors(self) -> dict[str, Tensor]:
         moments = {
@@ -154,7 +170,9 @@ class SAC:
             for name, optimizer in self._optimizers.items()
             for key, tensor in optimizer.tensors().items()
         }
+        origin = {"origin": self._origin.parameters.values} if self._origin is not None else {}
         return {
+            **origin,
             "actor": self._actor_parameters.values,
             "critics": self._critic_parameters.values,
             "targets": self._target_parameters.values,
@@ -173,6 +191,8 @@ class SAC:
         heads, values = self._actor_places[-1], self._critic_places[-1]
         self._mean, self._raw = (array_of(part) for part in columns(heads.output, 2))
         self._of_mean, self._of_raw = (array_of(part) for part in columns(heads.gradient, 2))
+        if self._origin is not None:
+            self._origin.allocate(batch_size)
         self._values, self._of_values = (array_of(part)[:, :, 0] for part in (values.output, values.gradient))
 
     def _draw(self) -> Sample:
@@ -202,7 +222,7 @@ class SAC:
         self._of_values[...] = errors * (2.0 / self._batch_size)
         self._critics.backward(batch.inputs, self._critic_places)
         self._critic_parameters.collect()
-        self._optimizers["critics"].step()
+        self._step("critics")
         self._critic_parameters.refresh()
         losses, means = (errors * errors) @ self._average, values @ self._average
         self._means.add(critic_loss=losses[0] + losses[1], q_value_1=means[0], q_value_2=means[1])
@@ -212,6 +232,8 @@ class SAC:
         # All of the actor's updates read the same observations, and the critics stand still meanwhile.
         self._critics.share(observations)
         self._actor.forward(observations, self._actor_places)
+        if self._origin is not None:
+            self._origin.forward(observations)
         for remaining in reversed(range(updates)):
             self._update_actor(observations, self._draw())
             if self.config.autotune or remaining:
@@ -229,44 +251,34 @@ class SAC:
         self._of_values[1] = reached - share
         of_actions = array_of(self._critics.action_gradient(self._critic_places))
         self._policy.backward(sample, of_actions, alpha * share, self._of_mean, self._of_raw)
+        penalty = self._hold_on(share)
         self._actor.backward(observations, self._actor_places)
         self._actor_parameters.collect()
-        self._optimizers["actor"].step()
+        self._step("actor")
         self._actor_parameters.refresh()
         log_prob, value = sample.log_prob @ self._average, self._math.minimum(first, second) @ self._average
-        self._means.add(actor_loss=alpha[0] * log_prob - value, entropy=-log_prob)
+        self._means.add(actor_loss=alpha[0] * log_prob - value + penalty, entropy=-log_prob)
+
+    @property
+    def _actor_learns(self) -> bool:
+        # Optimizers are asked only where something depends on it: on a GPU, that waits for all updates to end.
+        return not self.config.critics_first or actor_learns(self.config, self._optimizers["critics"].updates)
+
+    def _hold_on(self, share: float) -> Array:
+        """Adds the gradient of the penalty on the distance to the transferred policy; returns the penalty."""
+        weight = kickstart_weight(self.config, self._optimizers["actor"].updates) if self._origin is not None else 0.0
+        if self._origin is None or weight == 0.0:
+            return 0.0
+        return self._origin.pull((self._mean, self._raw), (self._of_mean, self._of_raw), weight * share)
+
+    def _step(self, name: str) -> None:
+        optimizer = self._optimizers[name]
+        optimizer.step(rate_share(self.config, optimizer.updates) if self.config.warmup else 1.0)
 
     def _update_temperature(self, sample: Sample) -> None:
         loss = -self._alpha_array[0] * (sample.log_prob @ self._average + self.target_entropy)
         # The loss is linear in alpha, so its derivative by log_alpha is itself.
         array_of(self._log_alpha_gradient)[...] = loss
-        self._optimizers["log_alpha"].step()
+        self._step("log_alpha")
         torch.exp(self.log_alpha, out=self._alpha)
         self._means.add(alpha_loss=loss, alpha=self._alpha_array[0])
-
-
-def _actor_groups(actor: Actor) -> list[Group]:
-    """Mean and log_std read the same hidden layer: one product. Their adapters read one of them each."""
-    layers = dict(actor.layers())
-    groups: list[Group] = [[[layer]] for name, layer in layers.items() if not name.startswith(("mean", "log_std"))]
-    groups.append([[actor.mean, actor.log_std]])
-    if actor.mean_adapter is not None and actor.log_std_adapter is not None:
-        groups.append([[actor.mean_adapter], [actor.log_std_adapter]])
-    return groups
-
-
-def _critic_groups(critics: Sequence[Critic]) -> list[Group]:
-    return [[[layer] for _, layer in twins] for twins in zip(*(critic.layers() for critic in critics), strict=True)]
-
-
-def _relus(network: Trunk) -> list[bool]:
-    """Whether ReLU follows, for each group of layers in the order of their application."""
-    adapter = [network.adapter_relu] if network.input_adapter is not None else []
-    return adapter + [not head for head in _heads(network)[len(adapter) :]]
-
-
-def _heads(network: Trunk) -> list[bool]:
-    """Whether it belongs to the head, which has no ReLU, for each group of layers in the order of their application."""
-    trunk = (network.input_adapter is not None) + 1 + len(network.hidden_names)
-    heads = 2 if isinstance(network, Actor) and network.mean_adapter is not None else 1
-    return [False] * trunk + [True] * heads

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from acmr.agent.fine_tuning import actor_learns, kickstart_weight, rate_share, set_biases
 from acmr.agent.learner import Means, learner, load_tensors
 from acmr.agent.networks import Networks
 from acmr.agent.replay_buffer import Batch
@@ -49,6 +50,8 @@ class PlainSAC:
         self.networks, self.config, self.device = networks.to(device), config, device
         self._generators = {"acting": acting, "learning": learning}
         self.targets = copy.deepcopy(nn.ModuleList(networks.critics)).requires_grad_(False)
+        # Whom the actor is held to at first: the policy as it was transferred.
+        self.origin = copy.deepcopy(networks.actor).requires_grad_(False) if config.kickstart else None
         # One nat less for each action (Haarnoja et al. 2018b, appendix D).
         self.target_entropy = -float(networks.dims.action)
         start = log_alpha if config.autotune else math.log(config.alpha)
@@ -90,6 +93,11 @@ class PlainSAC:
         return (alpha * log_prob - torch.minimum(*values)).mean()
 
     @staticmethod
+    def distance(outputs: tuple[Tensor, Tensor], origin: tuple[Tensor, Tensor]) -> Tensor:
+        """Half the squared distance of two policies' outputs (mean and raw log_std, each (batch, action)), averaged."""
+        return 0.5 * (torch.cat(outputs, dim=1) - torch.cat(origin, dim=1)).square().sum(dim=1).mean()
+
+    @staticmethod
     def temperature_loss(log_alpha: Tensor, log_prob: Tensor, target_entropy: float, config: SACConfig) -> Tensor:
         """Raises the temperature while the policy's entropy, -mean(log_prob), is under its target."""
         return (-log_alpha.exp() * (log_prob + target_entropy)).mean()
@@ -109,13 +117,17 @@ class PlainSAC:
         with as many updates on this batch, each followed by a temperature update.
         """
         self._update_critics(batch)
-        if global_step % self.config.policy_frequency == 0:
+        if global_step % self.config.policy_frequency == 0 and self._actor_learns:
             for _ in range(self.config.policy_frequency):
                 self._update_actor(batch.observations)
                 if self.config.autotune:
                     self._update_temperature(batch.observations)
         if global_step % self.config.target_network_frequency == 0:
             self._update_targets()
+
+    def set_biases(self, biases: Mapping[str, Tensor]) -> None:
+        """Begins with these biases of layers, by the layers' names, in networks and targets; before any update."""
+        set_biases(self.networks, self.targets, self.origin, biases)
 
     def metrics(self) -> dict[str, float]:
         """Means over the updates since the last call; NaN where there were none."""
@@ -146,6 +158,8 @@ class PlainSAC:
         for name, optimizer in self._optimizers.items():
             for index, moments in enumerate(optimizer.state.values()):
                 tensors |= {f"{name}.{index}.{key}": tensor for key, tensor in moments.items()}
+        if self.origin is not None:
+            tensors |= {f"origin.{name}": tensor for name, tensor in self.origin.state_dict().items()}
         return {**tensors, "log_alpha": self.log_alpha}
 
     def _sample(self, observations: Tensor) -> tuple[Tensor, Tensor]:
@@ -162,7 +176,7 @@ class PlainSAC:
             )
         values = torch.stack([critic(batch.observations, batch.actions) for critic in self.networks.critics])
         loss = self.critic_loss(values, expected, self.config)
-        _step(self._optimizers["critics"], loss)
+        self._step("critics", loss)
         first, second = values.detach().mean(dim=1)
         self._means.add(critic_loss=loss.detach(), q_value_1=first, q_value_2=second)
 
@@ -170,15 +184,33 @@ class PlainSAC:
         actions, log_prob = self._sample(observations)
         values = torch.stack([critic(observations, actions) for critic in self.networks.critics])
         loss = self.actor_loss(values, log_prob, self.log_alpha.exp().detach(), self.config)
-        _step(self._optimizers["actor"], loss)
+        if self.origin is not None:
+            weight = kickstart_weight(self.config, _updates(self._optimizers["actor"]))
+            outputs = self.networks.actor.outputs(observations), self.origin.outputs(observations)
+            loss = loss + weight * self.distance(*outputs)
+        self._step("actor", loss)
         self._means.add(actor_loss=loss.detach(), entropy=-log_prob.detach().mean())
 
     def _update_temperature(self, observations: Tensor) -> None:
         with torch.no_grad():
             _, log_prob = self._sample(observations)
         loss = self.temperature_loss(self.log_alpha, log_prob, self.target_entropy, self.config)
-        _step(self._optimizers["log_alpha"], loss)
+        self._step("log_alpha", loss)
         self._means.add(alpha_loss=loss.detach(), alpha=self.log_alpha.detach().exp()[0])
+
+    @property
+    def _actor_learns(self) -> bool:
+        return not self.config.critics_first or actor_learns(self.config, _updates(self._optimizers["critics"]))
+
+    def _step(self, name: str, loss: Tensor) -> None:
+        optimizer, group = self._optimizers[name], self._optimizers[name].param_groups[0]
+        if self.config.warmup:
+            lr = self.config.policy_lr if name == "actor" else self.config.q_lr
+            group["lr"] = lr * rate_share(self.config, _updates(optimizer))
+        # Gradients of these parameters only: the actor's loss must not leave any in the critics.
+        for parameter, gradient in zip(group["params"], torch.autograd.grad(loss, group["params"]), strict=True):
+            parameter.grad = gradient
+        optimizer.step()
 
     @torch.no_grad()
     def _update_targets(self) -> None:
@@ -197,9 +229,5 @@ def _adam(parameters: Iterable[Tensor], lr: float) -> torch.optim.Adam:
     return optimizer
 
 
-def _step(optimizer: torch.optim.Adam, loss: Tensor) -> None:
-    # Gradients of these parameters only: the actor's loss must not leave any in the critics.
-    parameters = optimizer.param_groups[0]["params"]
-    for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
-        parameter.grad = gradient
-    optimizer.step()
+def _updates(optimizer: torch.optim.Adam) -> int:
+    return int(next(iter(optimizer.state.values()))["step"])

@@ -127,6 +127,7 @@ class Session:
         # The run's own record comes first, whatever becomes of those that show it; a checkpoint of a step holds all of
         # that step, so its schedule comes last.
         watchers = make_watchers(spec, trainer.global_step, self.say)
+        trainer.audition.on_chosen = lambda line: self.say(f"{run_dir}: step {trainer.global_step:,}: {line}")
         trainer.observers = [state.logs, *watchers, schedule]
         try:
             state.clock.start()
@@ -178,6 +179,9 @@ class Session:
             "physics_warnings": dict(state.warnings.counts),
             "inexact_resumes": checkpoints.inexact,
         }
+        audition = state.trainer.audition
+        if audition.returns:
+            more |= {"audition": {"chosen": audition.best if audition.is_over else None, "returns": audition.returns}}
         steps, history = state.trainer.global_step, state.logs.history
         return summarize(self.prepared.spec, history, steps, state.clock.seconds, diverged) | more
 

@@ -18,6 +18,7 @@ from acmr.envs.state import ResumeCheck
 from acmr.run.random_streams import RandomStreams, random_streams
 from acmr.settings.run_spec import RunSpec
 from acmr.tracking.watchers import tracker_class
+from acmr.transfer.audition import Audition
 from acmr.transfer.find import find_teacher
 from acmr.transfer.methods import Student, transfer
 from acmr.transfer.report import TransferReport
@@ -32,6 +33,7 @@ class Prepared:
         about: Its environment.
         networks: Those that it starts with.
         report: What the transfer made of them.
+        audition: Which of several ways to begin it takes.
         learner: Makes the learner that ``agent`` chooses.
         log_alpha: Logarithm of the temperature that it starts with.
         streams: Its random numbers.
@@ -43,6 +45,7 @@ class Prepared:
     about: EnvDescription
     networks: Networks
     report: TransferReport
+    audition: Audition
     learner: Callable[..., Learner]
     log_alpha: float
     streams: RandomStreams
@@ -70,14 +73,15 @@ def prepare(spec: RunSpec) -> Prepared:
     check_memory(config, architecture)
     fresh = Networks(architecture, streams.networks)
     student = Student(fresh, about.observation_names, about.action_names)
-    networks, report = transfer(student, teacher, config.transfer, config.freeze, streams.networks)
+    transferred = transfer(student, teacher, config.transfer, config.freeze, streams.networks)
     copied_alpha = teacher is not None and config.transfer.copy_log_alpha
     log_alpha = teacher.description.log_alpha if teacher is not None and copied_alpha else 0.0
     return Prepared(
         spec=spec,
         about=about,
-        networks=networks,
-        report=report,
+        networks=transferred.networks,
+        report=transferred.report,
+        audition=transferred.audition,
         learner=learner,
         log_alpha=log_alpha,
         streams=streams,

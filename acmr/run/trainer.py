@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gymnasium as gym
 import numpy as np
@@ -23,6 +23,7 @@ from acmr.run.run_logs import RunLogs
 from acmr.stateful import State
 from acmr.text import message
 from acmr.tracking.observer import Observer
+from acmr.transfer.audition import Audition
 
 
 class DivergedError(Exception):
@@ -61,6 +62,7 @@ class Trainer:
         total_timesteps: Environment steps to take at most.
         log_every: Environment steps between two rows of metrics.
         episode: Sums over the current episode.
+        audition: Tries ways to begin in the first episodes; nothing is learned meanwhile.
         is_satisfied: Asked between two episodes whether the training may end before its last step.
         observers: Told of every step, episode and row of metrics, in their order; what one raises ends the training.
         global_step: Environment steps taken.
@@ -74,6 +76,7 @@ class Trainer:
     total_timesteps: int
     log_every: int
     episode: EpisodeInProgress
+    audition: Audition = field(default_factory=lambda: Audition({}))
     is_satisfied: Callable[[], bool] = _never
     observers: Sequence[Observer] = ()
     global_step: int = 0
@@ -87,7 +90,8 @@ class Trainer:
 
     def state_dict(self) -> State:
         """How far it is; its agent, environment, buffer, streams and episode have states of their own."""
-        return {"global_step": self.global_step, "observation": self.observation}
+        state: State = {"global_step": self.global_step, "observation": self.observation}
+        return state | {"audition": self.audition.state_dict()} if self.audition.returns else state
 
     def load_state_dict(self, state: State) -> None:
         """Goes on from there.
@@ -98,6 +102,8 @@ class Trainer:
         observation = state["observation"]
         if observation is not None and observation.shape != self.env.observation_space.shape:
             raise ValueError(f"an observation of shape {observation.shape}")
+        if self.audition.returns:
+            self.audition.load_state_dict(state["audition"])
         self.global_step, self.observation = int(state["global_step"]), observation
 
     def train(self) -> None:
@@ -131,8 +137,9 @@ class Trainer:
             observation, _ = self.env.reset(seed=None if self.global_step else self.streams.environment)
             self._check("an observation", observation)
         self.global_step += 1
-        learning = self.global_step > config.learning_starts
-        explores = config.start == RANDOM and not learning
+        trying = not self.audition.is_over
+        learning = self.global_step > config.learning_starts and not trying
+        explores = config.start == RANDOM and not learning and not trying
         action = self._random_action() if explores else self.agent.act(observation)
         self._check("the policy's action", action)
         next_observation, reward, terminated, truncated, info = self.env.step(action)
@@ -146,6 +153,10 @@ class Trainer:
             record = self.episode.record(self.global_step)
             for observer in self.observers:
                 observer.on_episode(record)
+            if trying:
+                self.audition.add(record.episodic_return)
+                # Of the one that plays next; where the audition is over now, of the one that was chosen.
+                self.agent.set_biases(self.audition.biases())
             self.episode.restart()
             self.observation = None
         if learning:
@@ -156,7 +167,8 @@ class Trainer:
         values = {"steps_per_second": speed, **metrics}
         for observer in self.observers:
             observer.on_metrics(self.global_step, values)
-        if self.global_step > self.agent.config.learning_starts:
+        # It is NaN, too, where there was no update; one that was would have left its mark on the weights.
+        if not math.isnan(metrics["critic_loss"]) or not is_finite(self.agent):
             self._check("the critics' loss", metrics["critic_loss"])
         self._check_learner()
 
@@ -208,6 +220,7 @@ def make_trainer(prepared: Prepared, env: gym.Env[np.ndarray, np.ndarray], logs:
         total_timesteps=config.most_steps,
         log_every=config.log_every,
         episode=EpisodeInProgress(about.reward_terms, about.has_forward_velocity),
+        audition=prepared.audition,
         is_satisfied=lambda: config.stop == THRESHOLD and logs.meet(config.threshold, config.consecutive),
     )
 

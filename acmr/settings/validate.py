@@ -21,6 +21,7 @@ from acmr.config import (
     EnvConfig,
     ExperimentConfig,
     flatten,
+    share_of_mean,
 )
 from acmr.records import MOST_SEED
 from acmr.text import holds_userinfo
@@ -50,7 +51,10 @@ def validate(config: ExperimentConfig) -> None:
     _at_least("threads", config.threads, 1, MOST_THREADS)
     for key in ("batch_size", "buffer_size", "policy_frequency", "target_network_frequency"):
         _at_least(f"agent.{key}", getattr(agent, key), 1)
-    _at_least("agent.learning_starts", agent.learning_starts, 0)
+    for key in ("learning_starts", "warmup", "critics_first"):
+        _at_least(f"agent.{key}", getattr(agent, key), 0)
+    _at_least("agent.kickstart_updates", agent.kickstart_updates, 1)
+    _within("agent.kickstart", agent.kickstart, low=0.0, high=math.inf)
     if config.checkpoint_every is not None:
         _at_least("checkpoint_every", config.checkpoint_every, 0)
     check_environment(config.env)
@@ -72,7 +76,7 @@ def validate(config: ExperimentConfig) -> None:
     _one_of("progress", config.progress, PROGRESS_MODES)
     _one_of("resume", config.resume, (EXACT, INEXACT))
     _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
-    _one_of("transfer.impute", config.transfer.impute, IMPUTATIONS)
+    _check_impute(config.transfer.impute)
     check_address("tracking.base_url", config.tracking.base_url)
     for key, value in flatten(asdict(config)).items():
         if holds_userinfo(value):
@@ -111,6 +115,12 @@ def check_environment(config: EnvConfig) -> None:
         _at_least("env.max_episode_steps", config.max_episode_steps, 1)
 
 
+def _check_impute(rule: str) -> None:
+    if rule not in IMPUTATIONS and share_of_mean(rule) is None:
+        allowed = f"one of {', '.join(IMPUTATIONS)}, or a share of the mean such as 0.75"
+        raise ConfigError(f"transfer.impute={rule}: must be {allowed}")
+
+
 def _check_stop(config: ExperimentConfig) -> None:
     _one_of("stop", config.stop, (HORIZON, THRESHOLD))
     after = config.stop_after
@@ -142,6 +152,11 @@ def _check_transfer(config: ExperimentConfig) -> None:
     if not rules.needs_teacher and transfer.copy_log_alpha:
         raise ConfigError(
             f"{name} transfer.copy_log_alpha=true: without a transfer no temperature is copied; "
+            f"leave it out{rules.or_instead}"
+        )
+    if not rules.needs_teacher and config.agent.kickstart:
+        raise ConfigError(
+            f"{name} agent.kickstart={config.agent.kickstart:g}: without a transfer there is no policy to hold on to; "
             f"leave it out{rules.or_instead}"
         )
     if config.freeze and not rules.freezable:

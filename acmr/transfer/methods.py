@@ -17,6 +17,7 @@ from acmr.agent.architecture import Dimensions, is_hidden
 from acmr.agent.networks import Networks
 from acmr.config import ConfigError, TransferConfig
 from acmr.registry import Registry
+from acmr.transfer.audition import Audition, Biases
 from acmr.transfer.report import TransferReport, report_transfer
 from acmr.transfer.teacher import Teacher
 
@@ -46,6 +47,8 @@ class Taken:
         fitted: Names of the layers that hold the teacher's values as far as they fit; they always learn.
         details: What else there is to say in ``transfer.json``.
         lines: The same for a reader, one fact a line.
+        choices: Ways to begin, by name, each with the biases it sets; where there is more than one, the student tries
+            them (:mod:`acmr.transfer.audition`).
     """
 
     networks: Networks
@@ -53,6 +56,22 @@ class Taken:
     fitted: list[str] = field(default_factory=list)
     details: dict[str, Any] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
+    choices: dict[str, Biases] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Transferred:
+    """A student that is ready to learn.
+
+    Attributes:
+        networks: What it learns with.
+        report: What became of each layer.
+        audition: Which of several ways to begin it takes; there may be none to choose from.
+    """
+
+    networks: Networks
+    report: TransferReport
+    audition: Audition
 
 
 #: Student, teacher (None where the method's rules say that it needs none), settings, source of new weights.
@@ -68,7 +87,7 @@ def transfer(
     config: TransferConfig,
     freeze: bool,
     generator: torch.Generator,
-) -> tuple[Networks, TransferReport]:
+) -> Transferred:
     """Gives a student what its method takes from the teacher, and freezes it where asked to.
 
     Args:
@@ -77,9 +96,6 @@ def transfer(
         config: Method, its rules and its settings.
         freeze: Whether the copied layers stop learning.
         generator: Source of the weights of layers that a method adds.
-
-    Returns:
-        The networks to learn with and the report.
 
     Raises:
         ConfigError: If the teacher does not fit the method.
@@ -97,7 +113,8 @@ def transfer(
         # The learner reads this: frozen layers are no part of what its optimizers step, nor of what its targets follow.
         layers[name].requires_grad_(False)
     report = report_transfer(taken.networks, teacher, config, freeze, (taken.copied, taken.fitted, frozen))
-    return taken.networks, replace(report, details=taken.details, notes=taken.lines)
+    report = replace(report, details=taken.details, notes=taken.lines)
+    return Transferred(taken.networks, report, Audition(taken.choices))
 
 
 @method("none")

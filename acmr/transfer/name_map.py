@@ -38,6 +38,11 @@ class NameMap:
     sensors: PartMap
     actuators: PartMap
 
+    @property
+    def is_less(self) -> bool:
+        """Whether the student lacks something that the teacher had."""
+        return bool(self.sensors.gone or self.actuators.gone)
+
     def lines(self) -> list[str]:
         """What is kept, gone and added."""
         return [self.sensors.line("sensors"), self.actuators.line("actuators")]

@@ -15,13 +15,16 @@ from torch import Tensor, nn
 
 from acmr.agent.architecture import ACTOR, CRITICS
 from acmr.agent.networks import Networks
-from acmr.config import INITIAL, MEAN, ConfigError, TransferConfig
+from acmr.config import AUTO, INITIAL, MEAN, ZERO, ConfigError, TransferConfig, share_of_mean
+from acmr.transfer.audition import Biases
 from acmr.transfer.methods import Student, Taken, copy_layers, method
 from acmr.transfer.name_map import NameMap, PartMap, map_bodies
 from acmr.transfer.teacher import Teacher
 
 #: Share of its usual size with which the head of an added actuator begins: it hardly moves at first.
 SMALL = 0.01
+#: What ``transfer.impute=auto`` tries, in this order.
+TRIED = ("0.25", "0.75", MEAN, ZERO)
 
 
 @method("named")
@@ -34,16 +37,21 @@ def named(student: Student, teacher: Teacher, config: TransferConfig, generator:
     if about.core is not None:
         # The adapters of a teacher that was itself expanded are what its sensors and actuators touch.
         networks = networks.with_core(about.architecture.core, about.adapter_activation, generator)
-    gone = imputed(teacher, config.impute)
-    outer = [*fit_inputs(networks, teacher, names, gone), *fit_heads(networks, teacher, names.actuators)]
+    rules = [config.impute] if config.impute != AUTO else list(TRIED) if names.is_less else [ZERO]
+    choices: dict[str, Biases] = {}
+    for rule in reversed(rules):
+        # The first comes last, and its biases stay.
+        inputs = fit_inputs(networks, teacher, names, imputed(teacher, rule))
+        choices[rule] = {name: networks.layers()[name].bias.detach().clone() for name in inputs}
+    outer = [*inputs, *fit_heads(networks, teacher, names.actuators)]
     inner = copy_layers(networks, teacher, (name for name in networks.layers() if name not in outer))
     details = {
         "sensors": _named_parts(names.sensors, *(each[0] for each in (theirs, ours))),
         "actuators": _named_parts(names.actuators, *(each[1] for each in (theirs, ours))),
         "impute": config.impute,
     }
-    lines = [*names.lines(), f"what is gone is given its {config.impute}"]
-    return Taken(networks, inner, fitted=outer, details=details, lines=lines)
+    lines = [*names.lines(), *([f"what is gone counts as {_said(config.impute)}"] if names.is_less else [])]
+    return Taken(networks, inner, outer, details, lines, choices={rule: choices[rule] for rule in rules})
 
 
 def renamed(pairs: Sequence[str]) -> dict[str, str]:
@@ -58,6 +66,13 @@ def renamed(pairs: Sequence[str]) -> dict[str, str]:
     return {old.strip(): new.strip() for old, new in (pair.split(":") for pair in pairs)}
 
 
+def _said(rule: str) -> str:
+    if rule == AUTO:
+        return f"what does best in the first episodes: {', '.join(map(_said, TRIED))}"
+    said = {MEAN: "its mean under the teacher's policy", INITIAL: "its mean at the start of an episode", ZERO: "zero"}
+    return said.get(rule) or f"{rule} of its mean under the teacher's policy"
+
+
 def imputed(teacher: Teacher, rule: str) -> tuple[np.ndarray, np.ndarray]:
     """What each of the teacher's observations, (observation,), and actions, (action,), counts as where it is gone.
 
@@ -65,15 +80,17 @@ def imputed(teacher: Teacher, rule: str) -> tuple[np.ndarray, np.ndarray]:
         ConfigError: If the teacher does not say what the rule asks for.
     """
     dims, known = teacher.description.dims, teacher.description.statistics
-    if rule not in (MEAN, INITIAL):
+    share = share_of_mean(rule)
+    if share == 0.0:
         return np.zeros(dims.observation), np.zeros(dims.action)
     if known is None:
         raise ConfigError(
             f"transfer.impute={rule}: {teacher.path} does not say what its teacher saw; type transfer.impute=zero"
         )
-    # An episode begins with a state, not with an action: there the mean serves either way.
-    seen = known.observation_mean if rule == MEAN else known.observation_initial
-    return np.array(seen), np.array(known.action_mean)
+    if share is None:
+        # An episode begins with a state, not with an action: there the mean serves either way.
+        return np.array(known.observation_initial), np.array(known.action_mean)
+    return share * np.array(known.observation_mean), share * np.array(known.action_mean)
 
 
 def fit_inputs(networks: Networks, teacher: Teacher, names: NameMap, gone: tuple[np.ndarray, np.ndarray]) -> list[str]:

@@ -126,12 +126,17 @@ class Adam:
             [values], [gradient], [self._mean], [self._square], [], [self._steps],
         )  # fmt: skip
 
-    def step(self) -> None:
-        """Takes one step down the gradient."""
+    @property
+    def updates(self) -> int:
+        """How many steps it has taken."""
+        return int(self._steps)
+
+    def step(self, share: float = 1.0) -> None:
+        """Takes one step down the gradient, of this share of its size."""
         self._steps.add_(1)
         torch._fused_adam_(
             *self._lists,
-            lr=self._lr,
+            lr=self._lr * share,
             beta1=0.9,
             beta2=0.999,
             weight_decay=0.0,
