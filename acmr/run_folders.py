@@ -71,8 +71,10 @@ def sealed(summary: Mapping[str, Any], files: Mapping[str, Mapping[str, Any]]) -
     return {**content, SEAL_ENTRY: _seal(content)}
 
 
-def changes(directory: Path, summary: Mapping[str, Any]) -> list[str]:
-    """What of a finished run is not as it was when the run ended, a line each; of older runs nothing is known.
+def changes(directory: Path, summary: Mapping[str, Any]) -> dict[str, str]:
+    """What of a finished run is not as it was when the run ended: files, and what is said of each.
+
+    Of runs that are older than their digests nothing is known.
 
     A table that was compressed since, as ``episodes.csv.gz``, is judged by what it holds.
 
@@ -81,12 +83,14 @@ def changes(directory: Path, summary: Mapping[str, Any]) -> list[str]:
         summary: The content of its ``summary.json``.
     """
     if FILES_ENTRY not in summary and SEAL_ENTRY not in summary:
-        return []
-    found = [f"{SUMMARY_FILE} was changed since"] if _seal(summary) != summary.get(SEAL_ENTRY) else []
+        return {}
+    if _seal(summary) != summary.get(SEAL_ENTRY):
+        # Of the others nothing is known then.
+        return {SUMMARY_FILE: f"{SUMMARY_FILE} was changed since the run ended"}
     files = summary.get(FILES_ENTRY)
     if not isinstance(files, Mapping) or not set(files) <= set(SEALED_FILES):
-        return found or [f"{SUMMARY_FILE} names files that are none of a run's"]
-    return found + [said for name, digest in files.items() if (said := _change(directory, name, digest))]
+        return {SUMMARY_FILE: f"{SUMMARY_FILE} names files that are none of a run's"}
+    return {name: said for name, digest in files.items() if (said := _change(directory, name, digest))}
 
 
 class _Search:

@@ -62,10 +62,16 @@ class Analysis:
 
     @property
     def notices(self) -> list[str]:
-        """What a reader has to know first: groups that are biased, and runs that contradict each other."""
+        """What a reader has to know first: biased groups, runs that contradict each other, what is not known."""
         odd = self.measured[self.measured["reason"].str.contains(DIFFERS, regex=False)]
         contradictions = [f"{name} ({run['state']}): {run['reason']}" for name, run in odd.iterrows()]
-        return [*dict.fromkeys(filter(None, self.measured["bias"])), *contradictions]
+        return [*dict.fromkeys(filter(None, self.measured["bias"])), *contradictions, *self.doubts]
+
+    @property
+    def doubts(self) -> list[str]:
+        """What is not known of runs that count, since a file of theirs was changed, cut off or is missing."""
+        told = self.measured[self.measured["counted"] & (self.measured["doubts"] != "")]
+        return [f"not all is known of {name}: {run['doubts']}" for name, run in told.iterrows()]
 
     @cached_property
     def study(self) -> Study:

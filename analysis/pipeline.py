@@ -30,8 +30,8 @@ def run(options: argparse.Namespace) -> int:
     print_summary(analysis.cells, analysis.comparisons, title)
     if options.summary:
         print_study(analysis)
-    biases = dict.fromkeys(filter(None, analysis.measured["bias"]))
-    print("\n".join(map(terminal, ["", *biases, *left_out_lines(analysis.measured), *lines, *closing])))
+    notes = [*dict.fromkeys(filter(None, analysis.measured["bias"])), *analysis.doubts]
+    print("\n".join(map(terminal, ["", *notes, *left_out_lines(analysis.measured), *lines, *closing])))
     return 0
 
 

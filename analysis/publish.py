@@ -125,7 +125,7 @@ def _files(run: Path, target: Path, scratch: Path) -> dict[str, bytes]:
     if ended_state(summary) is None:
         return {}
     if changed := changes(run, summary):
-        raise PublishError(f"{run}: {'; '.join(changed)}; put back what the run wrote, or make it anew")
+        raise PublishError(f"{run}: {'; '.join(changed.values())}; put back what the run wrote, or make it anew")
     files = dict(_packed(run / name) for name in RECORDS if (run / name).is_file())
     files[SUMMARY_FILE] = _resealed(summary, files)
     # The networks of a run that diverged are of no use.

@@ -101,7 +101,8 @@ def view_run(directory: Path, name: str, seed: int, total: int = 0, state: State
     ended = None if summary is None else ended_state(summary)
     if summary is not None and ended is not None:
         if changed := changes(directory, read_json(directory / SUMMARY_FILE) or {}):
-            reason = f"it ended, but {'; '.join(changed)}; put back what it wrote, or run it anew with force=true"
+            what = "; ".join(changed.values())
+            reason = f"it ended, but {what}; put back what it wrote, or run it anew with force=true"
             return RunStatus(name, seed, directory, FAILED, total=total, reason=reason)
         step, speed = int(summary.get("global_step") or 0), float(summary.get("steps_per_second") or 0)
         met, latest = summary.get("steps_to_threshold"), summary.get("final_return")

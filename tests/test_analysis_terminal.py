@@ -23,7 +23,7 @@ GROUPS = [f"{BASE}{rate}-total_timesteps=100000" for rate in ("0.0001", "0.0003"
 @pytest.mark.parametrize("columns", ["", "40", "80"])
 def test_in_a_pipe_nothing_is_cropped(columns: str, tmp_path: Path) -> None:
     for group in GROUPS:
-        summary = {"cell": None, "run": group}
+        summary = {"cell": None, "run": group, "env": "Ant-v5"}
         made = write_run(tmp_path / "made", "A1", 1, rows_reaching(50_000, 100_000), total=100_000, summary=summary)
         (tmp_path / "runs" / group).mkdir(parents=True)
         made.rename(tmp_path / "runs" / group / "seed_1")

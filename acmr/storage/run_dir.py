@@ -95,7 +95,7 @@ class RunDir:
         """
         if changed := changes(self.path, self.summary() or {}):
             raise ConfigError(
-                f"{self.path}: a finished run, but {'; '.join(changed)}; put back what the run wrote, or type "
+                f"{self.path}: a finished run, but {'; '.join(changed.values())}; put back what the run wrote, or type "
                 "force=true to run it anew"
             )
 

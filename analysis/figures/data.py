@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from acmr.cells import CELLS
-from acmr.records import COMPLETE, VELOCITY_COLUMN
+from acmr.records import COMPLETE, METRICS_FILE, VELOCITY_COLUMN
 from analysis.figures.style import Palette
 from analysis.loading.read_run import FOREIGN, UNFINISHED
 from analysis.loading.speed import read_speed
@@ -186,6 +186,8 @@ def training_speeds(root: Path, runs: pd.DataFrame, groups: list[str]) -> pd.Dat
     parts = []
     for group in groups:
         for name, run in drawn_runs(runs, group).iterrows():
+            if METRICS_FILE in run["doubts"]:
+                continue
             starts = run["learning_starts"]
             own = read_speed(root / run["directory"], 0.0 if pd.isna(starts) else float(starts))
             parts.append(own.assign(group=group, run=str(name)))

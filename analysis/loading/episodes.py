@@ -57,6 +57,8 @@ def read_episodes(path: Path, own: bool = False, ended: bool = False) -> tuple[p
     numbers.setdefault(VELOCITY_COLUMN, np.full(len(lines), np.nan))
     frame = pd.DataFrame({column: numbers[column] for column in _KNOWN})
     _check_order(path.name, frame, lines, own)
+    if own:
+        notes += _odd_lengths(path.name, frame, lines)
     returns = frame["episodic_return"].to_numpy()
     # Of the comparisons with NaN none is true.
     odd = ~(np.abs(returns) < _MOST_RETURN)
@@ -142,6 +144,17 @@ def _to_counts(name: str, column: str, values: NDArray[Any], lines: NDArray[np.i
         row = int(np.argmin(whole))
         raise DamagedError(f"{name}: line {lines[row]}: {column} is {values[row]:g}, not a count of steps")
     return values.astype(np.int64)
+
+
+def _odd_lengths(name: str, frame: pd.DataFrame, lines: NDArray[np.int64]) -> list[str]:
+    """A note if an episode has not as many steps as passed since the one before: a number was changed."""
+    passed = np.diff(frame["global_step"].to_numpy(), prepend=0)
+    odd = np.flatnonzero(passed != frame["episode_length"].to_numpy())
+    if not odd.size:
+        return []
+    row, more = int(odd[0]), f", and so in {odd.size - 1} more lines" if odd.size > 1 else ""
+    length = frame["episode_length"].iloc[row]
+    return [f"{name}: line {lines[row]}: an episode of {length} steps, {passed[row]} after the one before{more}"]
 
 
 def _check_order(name: str, frame: pd.DataFrame, lines: NDArray[np.int64], own: bool) -> None:

@@ -36,12 +36,14 @@ class RunSet:
         root: The runs folder.
         runs: One row a run, indexed by its path below the root in visible letters: ``directory`` (that path as the
             file system has it), ``group, cell, seed, profile, env, transfer, freeze``
-            (see :class:`~analysis.loading.identify.Identity`), ``state`` and ``reason``, ``counted`` (enters
-            comparisons), ``episodes`` (number), ``last_step`` (end of the last episode), ``horizon`` (step up to which
-            the run is known not to have reached the threshold, if it has not), ``cut`` (ends at its own threshold, as
-            ``stop=threshold`` has it, before its last step), ``stop_after`` (step at which such a run ends at the
-            latest), ``total_timesteps``, ``learning_starts``, ``acts_from`` (step from which the agent chooses its
-            actions), ``threshold``, ``consecutive``, ``wall_seconds``, ``steps_per_second``.
+            (see :class:`~analysis.loading.identify.Identity`), ``state`` and ``reason``, ``doubts`` (what
+            is not known of a run that counts, as a file was changed or is missing), ``counted`` (enters
+            comparisons), ``episodes`` (number), ``last_step`` (end of the last episode), ``horizon`` (step
+            up to which the run is known not to have reached the threshold, if it has not), ``cut`` (ends at
+            its own threshold, as ``stop=threshold`` has it, before its last step), ``stop_after`` (step at
+            which such a run ends at the latest), ``total_timesteps``, ``learning_starts``, ``acts_from``
+            (step from which the agent chooses its actions), ``threshold``, ``consecutive``,
+            ``wall_seconds``, ``steps_per_second``.
         episodes: One row an episode: ``run, group, seed`` and the columns of ``episodes.csv``; steps ascend within a
             run.
         configs: The settings of each run that has them.
@@ -116,7 +118,7 @@ def _named(runs: list[FoundRun]) -> dict[str, FoundRun]:
 
 
 _RUN_COLUMNS = (
-    *("run", "directory", "group", "cell", "seed", "profile", "env", "transfer", "freeze", "state", "reason"),
+    *("run", "directory", "group", "cell", "seed", "profile", "env", "transfer", "freeze", "state", "reason", "doubts"),
     *("episodes", "last_step", "horizon", "cut"),
     *("total_timesteps", "stop_after", "learning_starts", "acts_from", "threshold", "consecutive"),
     *("wall_seconds", "steps_per_second", "steps_in_summary"),

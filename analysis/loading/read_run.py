@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
     DIVERGED,
+    ENDED,
     EPISODE_COLUMNS,
     EPISODE_FILES,
     EPISODES_FILE,
@@ -31,7 +33,8 @@ from acmr.run_folders import RunFolder
 from acmr.text import LONGEST_MESSAGE
 from analysis.loading.episodes import read_episodes
 from analysis.loading.identify import Identity, identify
-from analysis.loading.values import MOST_STEPS, check_numbers, number, read_mapping
+from analysis.loading.run_files import RunFiles, read_files
+from analysis.loading.values import MOST_STEPS, number, read_mapping
 
 #: States of a run that is there, beside those that it says itself.
 FOREIGN, UNFINISHED, UNKNOWN, DAMAGED, DUPLICATE = "foreign", "unfinished", "unknown", "damaged", "duplicate"
@@ -65,29 +68,27 @@ def read_run(root: Path, folder: RunFolder) -> FoundRun:
     """
     directory, problem = folder.path, folder.problem
     notes = [problem] if problem else []
-    damaged = bool(problem)
-    config, summary, frame = dict[str, Any](), dict[str, Any](), no_episodes()
-    left_out, more = list[str](), list[str]()
-    try:
-        config, left_out = check_numbers(CONFIG_FILE, read_mapping(directory / CONFIG_FILE))
-        summary, more = check_numbers(SUMMARY_FILE, read_mapping(directory / SUMMARY_FILE))
-        path = next((directory / name for name in EPISODE_FILES if (directory / name).is_file()), None)
-        if path is not None:
-            frame, said = read_episodes(path, own=bool(config), ended=bool(summary))
-            notes += said
-        elif not problem:
-            notes.append(f"no {EPISODES_FILE}")
-    except DamagedError as error:
-        notes.append(str(error))
-        damaged = True
+    files, frame, said = read_files(directory), no_episodes(), list[str]()
+    notes += files.problems
+    damaged = bool(notes)
+    if not files.problems:
+        try:
+            frame, said = _episodes(directory, files)
+            notes += said if len(frame) or not problem else []
+        except DamagedError as error:
+            notes.append(str(error))
+            damaged = True
     name = directory.relative_to(root).as_posix()
     parent = Path(name).parent.as_posix() if directory != root else directory.resolve().parent.name
+    config, summary = files.config, files.summary
     identity = identify(directory, parent if parent != "." else root.resolve().name, config, summary)
-    state, reasons = (DAMAGED, []) if damaged else _state(directory, identity, frame, config, summary, notes)
-    reasons += [*left_out, *more]
+    state, reasons = (DAMAGED, []) if damaged else _state(directory, identity, frame, files, notes)
+    measures = _measures(state, frame, config, summary)
+    doubts = [*files.doubts, *_unknown(state, measures)]
+    reasons += [*doubts, *files.left_out]
     reasons += [f"also found as {other.relative_to(root).as_posix()}" for other in folder.others]
     row = {"run": name, **vars(identity), "state": state, "reason": "; ".join([*notes, *reasons])}
-    row |= _measures(state, frame, config, summary) | _stop(name, frame, config, summary)
+    row |= measures | _stop(name, frame, config, summary) | {"doubts": "; ".join([*said, *doubts])}
     if state == DIVERGED and not pd.isna(row["stop_after"]):
         row["horizon"] = int(row["stop_after"])  # it would not have been watched any longer
     elif state == UNFINISHED:
@@ -95,21 +96,30 @@ def read_run(root: Path, folder: RunFolder) -> FoundRun:
     return FoundRun(row, frame, config, summary)
 
 
+def _episodes(directory: Path, files: RunFiles) -> tuple[pd.DataFrame, list[str]]:
+    path = next((directory / name for name in EPISODE_FILES if (directory / name).is_file()), None)
+    if path is None:
+        return no_episodes(), [f"no {EPISODES_FILE}"]
+    return read_episodes(path, own=files.begun, ended=bool(files.summary))
+
+
 def _state(
-    directory: Path,
-    identity: Identity,
-    frame: pd.DataFrame,
-    config: dict[str, Any],
-    summary: dict[str, Any],
-    notes: list[str],
+    directory: Path, identity: Identity, frame: pd.DataFrame, files: RunFiles, notes: list[str]
 ) -> tuple[str, list[str]]:
     if identity.seed is None:
         return DAMAGED, ["its seed is not known: call its folder seed_<n>, n a whole number below 2^63"]
-    if summary:
-        return _ended_state(frame, summary, notes)
-    if not config and len(frame):
+    if files.summary:
+        return _ended_state(frame, files.summary, notes)
+    if not files.begun and len(frame):
         return FOREIGN, [f"no {CONFIG_FILE} and no {SUMMARY_FILE}: taken as complete"]
     return UNFINISHED, [_unfinished(directory)]
+
+
+def _unknown(state: str, measures: Mapping[str, float | int | None]) -> list[str]:
+    """What a run that counts does not tell of itself."""
+    if state not in ENDED or measures["acts_from"] is not None:
+        return []
+    return ["how many actions it began with at random is not known, and so its initial return is not"]
 
 
 def _ended_state(frame: pd.DataFrame, summary: dict[str, Any], notes: list[str]) -> tuple[str, list[str]]:
@@ -158,7 +168,7 @@ def _measures(
         "horizon": max(last, int(next((end for end in ends if end is not None), last))),
         "total_timesteps": total,
         "learning_starts": starts,
-        "acts_from": 0.0 if agent.get("start") == POLICY else starts,
+        "acts_from": 0.0 if agent.get("start") == POLICY or state == FOREIGN else starts,
         "threshold": number(summary.get("threshold", config.get("threshold"))),
         "consecutive": number(summary.get("consecutive", config.get("consecutive"))),
         "wall_seconds": number(summary.get("wall_seconds")),

@@ -52,11 +52,11 @@ def initial_return(
         global_steps: Step at each episode's end, (episodes,), ascending.
         lengths: Steps in each episode, (episodes,).
         returns: Raw return of each episode, (episodes,).
-        start: Step from which the agent chooses its actions.
+        start: Step from which the agent chooses its actions; NaN if that is not known.
         episodes: Episodes to average.
 
     Returns:
-        The mean, NaN if there are none.
+        The mean, NaN if there are none or ``start`` is not known.
     """
     begins = np.asarray(global_steps, dtype=float) - np.asarray(lengths, dtype=float)
     return _mean(np.asarray(returns, dtype=float)[begins >= start][:episodes])
@@ -144,7 +144,7 @@ def measure(data: RunSet, threshold: float, consecutive: int) -> pd.DataFrame:
         empty (:func:`analysis.statistics.early_ends.settle` fills it).
     """
     rows: dict[str, dict[str, Any]] = {}
-    starts = data.runs["acts_from"].fillna(0.0).to_dict()
+    starts = data.runs["acts_from"].to_dict()
     for name, episodes in data.episodes.groupby("run", observed=False, sort=False):
         start = float(starts[str(name)])
         rows[str(name)] = _measure_run(episodes, start, threshold, consecutive)
