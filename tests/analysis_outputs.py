@@ -2,7 +2,15 @@
 
 FIGURES = {
     *("figure_4", "figure_5", "figure_6", "kaplan_meier", "sensitivity", "steps_per_seed", "differences"),
-    *("learning_curves", "episode_length", "forward_velocity", "transfer_metrics", "training_speed", "wall_clock"),
+    *(
+        "learning_curves",
+        "episode_length",
+        "forward_velocity",
+        "transfer_metrics",
+        "training_speed",
+        "wall_clock",
+        "return_profiles",
+    ),
 }
 TABLES = {
     *("table1", "table2", "table3", "published_table3", "cells", "transfer", "steps_to_threshold", "comparisons"),

@@ -78,6 +78,17 @@ class FigureData:
         """Last step of the longest run."""
         return float(self.runs["horizon"].max()) if len(self.runs) else 1.0
 
+    def size(self, group: str) -> str:
+        """A group and how many of its runs are drawn, for captions."""
+        runs = self.drawn(group)
+        said = [f"{len(runs)} run{'' if len(runs) == 1 else 's'}"]
+        if len(runs) and not runs["counted"].any():
+            said.append("unfinished")
+        elif cut := int(runs["cut"].sum()):
+            said.append(f"{cut} stopped at {'its' if cut == 1 else 'their'} threshold")
+        said += ["biased"] if self.is_biased(group) else []
+        return f"{group} ({', '.join(said)})"
+
 
 Draw = Callable[[FigureData, Palette], Figure | None]
 
@@ -95,6 +106,17 @@ class FigureSpec:
     draw: Draw
     #: Whether it leaves out groups that are no cells where there are more than ``MOST_OTHERS``.
     limited: bool = False
+    #: What it draws of these data, for its caption; None: every group with something to draw.
+    shows: Callable[[FigureData], list[str]] | None = None
+
+    def said(self, data: FigureData) -> str:
+        """Its caption: what it shows, and of what."""
+        text, left_out = self.caption.format(window=data.window), data.others[MOST_OTHERS:] if self.limited else []
+        if left_out:
+            text += f" Of the {len(data.others)} groups that are no cells the first {MOST_OTHERS} are drawn."
+        groups = [group for group in data.present(data.groups) if group not in left_out]
+        shown = self.shows(data) if self.shows else [data.size(group) for group in groups]
+        return f"{text} Drawn: {', '.join(shown)}." if shown else text
 
 
 def drawn_runs(runs: pd.DataFrame, group: str) -> pd.DataFrame:

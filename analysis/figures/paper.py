@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,22 +15,22 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from acmr.cells import CELLS, SOURCE, TARGET
-from analysis.figures import rows, sensitivity, steps, survival
+from analysis.figures import profiles, rows, sensitivity, steps, survival
 from analysis.figures.data import Draw, FigureData, FigureSpec, mean_curve
-from analysis.figures.parts import count_label, mark_leaving, marker_style, short_steps, step_axis
+from analysis.figures.parts import count_label, legend_columns, mark_leaving, marker_style, short_steps, step_axis
 from analysis.figures.style import COLUMN, PALETTES, Palette
 
 
-def _paper_figure(cells: tuple[str, ...], override: dict[str, str] | None = None) -> Draw:
-    """One of figures 4 to 6: the learning curves of these cells; ``override`` names colors that differ there."""
+def _paper_figure(cells: tuple[str, ...]) -> Draw:
+    """One of figures 4 to 6: the learning curves of these cells."""
 
     def draw(data: FigureData, palette: Palette) -> Figure | None:
         present = data.present(cells)
         if not present:
             return None
         figure, axes = plt.subplots(figsize=(COLUMN, 2.6), layout="constrained")
-        handles = []
-        colors = {cell: palette.color(cell, data.groups, override) for cell in present}
+        handles: list[Line2D] = []
+        colors = {cell: palette.color(cell, data.groups) for cell in present}
         for cell in present:
             _raw_background(axes, data, cell, colors[cell])
         for cell in present:
@@ -41,7 +41,9 @@ def _paper_figure(cells: tuple[str, ...], override: dict[str, str] | None = None
         axes.set(xlabel="global step", ylabel="episodic return", xlim=(0, data.horizon))
         step_axis(axes.xaxis)
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-        figure.legend(handles=handles, loc="outside lower center", ncol=2, handlelength=1.8, columnspacing=1.2)
+        columns = legend_columns([str(handle.get_label()) for handle in handles])
+        figure.set_figheight(2.2 + 0.14 * -(-len(handles) // columns))
+        figure.legend(handles=handles, loc="outside lower center", ncol=columns, handlelength=1.8, columnspacing=1.2)
         return figure
 
     return draw
@@ -74,8 +76,6 @@ def _curve(axes: Axes, data: FigureData, palette: Palette, cell: str, color: obj
     return axes.plot(steps, values, color=color, label=label, zorder=3, **style)[0]
 
 
-#: The paper draws the first two curves of every figure in these, whatever color a cell has elsewhere.
-_FIRST_COLORS = ("blue", "orange")
 _HOW = (
     "Rolling averages over {window} episodes, averaged over the seeds; behind them the raw returns of the first seed "
     "(seed 1 unless it is missing); black: threshold; dashed: mean steps to threshold from the raw returns (StT; where "
@@ -85,26 +85,39 @@ _HOW = (
 #: What the paper's cells are compared with, and the cells of each environment.
 _BASELINES = tuple(dict.fromkeys(cell.baseline for cell in CELLS.values() if cell.published and cell.baseline))
 _SOURCE, _TARGET = (tuple(cell.name for cell in CELLS.values() if cell.role == role) for role in (SOURCE, TARGET))
-_OWN = [name for name in _TARGET if not CELLS[name].published]
+
+
+def _of(cells: tuple[str, ...]) -> Callable[[FigureData], list[str]]:
+    return lambda data: [data.size(cell) for cell in data.present(cells)]
+
 
 FIGURES = (
     FigureSpec(
         "figure_4",
         "Figure 4",
-        f"Baselines {' and '.join(_BASELINES)}. {_HOW}",
-        _paper_figure(_BASELINES, dict(zip(_BASELINES, _FIRST_COLORS, strict=False))),
+        f"Baselines in both environments. {_HOW}",
+        _paper_figure(_BASELINES),
+        shows=_of(_BASELINES),
     ),
-    FigureSpec("figure_5", "Figure 5", f"{', '.join(['A0 to A4', *_OWN])}. {_HOW}", _paper_figure(_TARGET)),
+    FigureSpec(
+        "figure_5",
+        "Figure 5",
+        f"Cells of the target environment. {_HOW}",
+        _paper_figure(_TARGET),
+        shows=_of(_TARGET),
+    ),
     FigureSpec(
         "figure_6",
         "Figure 6",
-        f"Proof of concept: {' and '.join(_SOURCE)}. {_HOW}",
-        _paper_figure(_SOURCE, dict(zip(_SOURCE, _FIRST_COLORS, strict=False))),
+        f"Proof of concept: cells of the source environment. {_HOW}",
+        _paper_figure(_SOURCE),
+        shows=_of(_SOURCE),
     ),
     *survival.FIGURES,
     *sensitivity.FIGURES,
     *steps.FIGURES,
     *rows.FIGURES,
+    *profiles.FIGURES,
 )
 
 

@@ -48,9 +48,23 @@ def two_lines(label: str, width: int = 18) -> str:
     """A label broken after a hyphen or blank, where it is long."""
     if len(label) <= width:
         return label
+    name, bracket, rest = label.partition(" (")
+    if bracket and max(len(name), len(rest) + 1) <= width:
+        return f"{name}\n({rest}"
     breaks = [at + 1 for at, sign in enumerate(label[:-1]) if sign in "- …"]
     at = min(breaks or [len(label) // 2], key=lambda at: abs(at - len(label) / 2))
     return f"{label[:at].rstrip()}\n{label[at:]}"
+
+
+def set_title(axes: Axes, text: str, room: int = 21) -> None:
+    """Writes a panel's title, in letters so small that its longest line fits ``room`` letters of the usual size."""
+    longest = max(map(len, text.split("\n")))
+    axes.set_title(text, pad=2, fontsize=max(4.5, 7.0 * min(1.0, room / max(longest, 1))))
+
+
+def legend_columns(labels: Sequence[str]) -> int:
+    """How many columns of a legend fit into a figure."""
+    return 2 if max(map(len, labels), default=0) <= 24 else 1
 
 
 def count_label(data: FigureData, group: str) -> str:

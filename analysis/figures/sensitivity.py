@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from analysis.figures.data import FigureData, FigureSpec
-from analysis.figures.parts import short_name, short_steps, two_lines
+from analysis.figures.parts import set_title, short_name, short_steps, two_lines
 from analysis.figures.style import COLUMN, Palette
 from analysis.statistics.study.sensitivity import ALL, FULL, RESTRICTED
 
@@ -35,7 +35,7 @@ def sensitivity(data: FigureData, palette: Palette) -> Figure | None:
     for row, ((reference, index), own) in zip(grid, pairs, strict=True):
         for axes, basis in zip(row, bases, strict=True):
             _panel(axes, own[own["basis"] == basis], styles, data.threshold)
-            axes.set_title(_title(data.sensitivity, str(reference), str(index), basis), pad=2, fontsize=6.5)
+            set_title(axes, _title(data.sensitivity, str(reference), str(index), basis), room=25)
     for axes in grid[-1]:
         axes.set_xlabel("threshold (return)")
     figure.supylabel("difference in steps (below 0: index faster)", fontsize=7)
@@ -45,12 +45,13 @@ def sensitivity(data: FigureData, palette: Palette) -> Figure | None:
 
 
 def _title(points: pd.DataFrame, reference: str, index: str, basis: str) -> str:
-    name = two_lines(f"{short_name(index)} − {short_name(reference)}", 24)
+    name = f"{short_name(index)} − {short_name(reference)}"
+    name = f"{name}, " if len(name) <= 12 else f"{two_lines(name, 24)}\n"
     own = points[(points["reference"] == reference) & (points["index"] == index) & (points["basis"] == basis)]
     if own.empty:
-        return f"{name}, no {basis} runs"
+        return ""  # all of them are full, or none is
     sizes = own[["runs_index", "runs_reference"]].iloc[0]  # in the order of the names
-    return f"{name}, {basis} runs: {sizes.iloc[0]} + {sizes.iloc[1]}"
+    return f"{name}{basis} runs: {sizes.iloc[0]} + {sizes.iloc[1]}"
 
 
 def _styles(names: list[str]) -> dict[str, dict[str, Any]]:
@@ -90,6 +91,11 @@ def _panel(axes: Axes, own: pd.DataFrame, styles: dict[str, dict[str, Any]], thr
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short_steps(value)))
 
 
+def _shows(data: FigureData) -> list[str]:
+    known = data.sensitivity.dropna(subset=["difference"])
+    return list(dict.fromkeys(f"{row['index']} − {row['reference']}" for row in known.to_dict("records")))
+
+
 FIGURES = (
     FigureSpec(
         "sensitivity",
@@ -100,5 +106,6 @@ FIGURES = (
         "has a single run; bars: restricted means, for some run never met the criterion. One setting was chosen "
         "before; the others are no tests.",
         sensitivity,
+        shows=_shows,
     ),
 )

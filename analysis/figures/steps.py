@@ -10,7 +10,16 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from acmr.cells import CELLS
 from acmr.records import VELOCITY_COLUMN
 from analysis.figures.data import MOST_OTHERS, FigureData, FigureSpec, mean_curve
-from analysis.figures.parts import count_label, finish, mark_leaving, marker_style, stacked, step_axis, two_lines
+from analysis.figures.parts import (
+    count_label,
+    finish,
+    mark_leaving,
+    marker_style,
+    set_title,
+    stacked,
+    step_axis,
+    two_lines,
+)
 from analysis.figures.style import COLUMN, Palette
 
 
@@ -29,7 +38,7 @@ def learning_bands(data: FigureData, palette: Palette) -> Figure | None:
         sns.lineplot(own, x="step", y="episodic_return", color=color, errorbar=("pi", 100), ax=axes, legend=False)
         mark_leaving(axes, data, group, "episodic_return", color)
         axes.axhline(data.threshold, color="black", linewidth=0.7)
-        axes.set_title(two_lines(count_label(data, group), 24), pad=2)
+        set_title(axes, two_lines(count_label(data, group), 24))
         axes.set(xlabel="", ylabel="", xlim=(0, data.horizon))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         step_axis(axes.xaxis)

@@ -47,16 +47,15 @@ class Palette:
     name: str
     markers: bool
 
-    def color(self, group: str, groups: Sequence[str], override: dict[str, str] | None = None) -> Any:
-        """Color of a group.
+    def color(self, group: str, groups: Sequence[str]) -> Any:
+        """Color of a group, the same in all figures.
 
         Args:
             group: Its name.
             groups: All groups, so that those that are no cells get colors of their own.
-            override: Names of colors that differ in this figure, by cell.
         """
         if group in CELLS:
-            name = (override or {}).get(group, CELLS[group].color)
+            name = CELLS[group].color
             return (_SAFE if self.markers else _TAB).get(name, name)
         others = [other for other in groups if other not in CELLS]
         return sns.husl_palette(len(others), l=0.5)[others.index(group)]

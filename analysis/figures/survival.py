@@ -106,7 +106,9 @@ def _numbers(
         )
         counts = at_risk(_watched(data, group)["time"], moments)
         for moment, count in zip(moments, counts, strict=True):
-            axes.text(moment, row, str(count), ha="center", va="center", fontsize=6, color=color)
+            # At the ends they stay within the panel, beside which the lines of the legend are.
+            side = "left" if moment == 0 else "right" if moment == data.horizon else "center"
+            axes.text(moment, row, str(count), ha=side, va="center", fontsize=6, color=color)
 
 
 FIGURES = (

@@ -15,7 +15,7 @@ from acmr.names import archive_keys
 from analysis import FORMATS
 from analysis.analyze import Analysis
 from analysis.figures import stills
-from analysis.figures.data import MOST_OTHERS, FigureData, default_window, learning_curves, training_speeds
+from analysis.figures.data import FigureData, default_window, learning_curves, training_speeds
 from analysis.figures.paper import FIGURES, draw_all, picture, save
 from analysis.figures.style import apply
 from analysis.report.html import Picture, Report, data_uri, write_report
@@ -112,11 +112,16 @@ def _write_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
                 np.lib.format.write_array(file, array, allow_pickle=False)
 
 
-def _write_figures(analysis: Analysis, out: Path, options: argparse.Namespace, written: Written) -> list[Picture]:
-    apply()
+def figure_data(analysis: Analysis, window: int | None = None) -> FigureData:
+    """What the figures draw.
+
+    Args:
+        analysis: The numbers.
+        window: Episodes of the rolling average; None: the paper's, fewer for short runs.
+    """
     measured, data = analysis.measured, analysis.data
-    window = options.window or default_window(measured, data.episodes)
-    drawing = FigureData(
+    window = window or default_window(measured, data.episodes)
+    return FigureData(
         runs=measured,
         episodes=data.episodes,
         groups=data.groups,
@@ -128,15 +133,17 @@ def _write_figures(analysis: Analysis, out: Path, options: argparse.Namespace, w
         speeds=training_speeds(data.root, measured, data.groups),
         sensitivity=analysis.study.points,
     )
+
+
+def _write_figures(analysis: Analysis, out: Path, options: argparse.Namespace, written: Written) -> list[Picture]:
+    apply()
+    drawing = figure_data(analysis, options.window)
     made: dict[str, Picture] = {}
     for spec, palette, figure in draw_all(drawing):
         folder = "" if palette.name == "paper" else palette.name
         svg = save(figure, out / folder, spec.name, options.format)
         files = [f"{spec.name}.{kind}" for kind in options.format]
-        caption = spec.caption.format(window=window)
-        if spec.limited and len(drawing.others) > MOST_OTHERS:
-            caption += f" Of the {len(drawing.others)} groups that are no cells the first {MOST_OTHERS} are drawn."
-        entry = made.setdefault(spec.name, Picture(spec.name, spec.title, caption, {}, files))
+        entry = made.setdefault(spec.name, Picture(spec.name, spec.title, spec.said(drawing), {}, files))
         entry.images[palette.name] = data_uri(svg, "svg+xml")
     written.figures += len(made)
     return list(made.values())
