@@ -74,7 +74,7 @@ def _train_job(path: Path) -> None:
     from sweeps.job import adopt
 
     try:
-        _run(adopt(path))
+        _run(*adopt(path))
     except ConfigError as error:
         # Nobody watches a run of a sweep: its log keeps the way to where the code of its environment failed.
         if error.exit_code == ENDED_BY_ENVIRONMENT:
@@ -85,11 +85,11 @@ def _train_job(path: Path) -> None:
         raise
 
 
-def _run(spec: RunSpec) -> None:
+def _run(spec: RunSpec, begun: Callable[[], None] = lambda: None) -> None:
     # Here, so that a wrong setting is refused without waiting for torch and MuJoCo to load.
     from acmr.run.experiment import exit_code, run_experiment
 
-    if code := exit_code(run_experiment(spec)):
+    if code := exit_code(run_experiment(spec, begun=begun)):
         sys.exit(code)
 
 

@@ -1,7 +1,8 @@
 """The directory of a sweep: its plan and settings as they were at its start, and the state of each run.
 
 ``<output_dir>/.sweeps/<id>/`` holds ``plan.json``, the runs' settings (``jobs``), a copy of ``conf``, the state of each
-run (``states``) and, once the sweep is to stop, ``stop``. Free of Hydra, so that ``make status`` starts quickly.
+run (``states``), which were begun anew in it (``begun``) and, once the sweep is to stop, ``stop``. What cannot be read
+stops nobody: a state counts as waiting, the plan of a sweep that is over is set aside. Free of Hydra, to start quickly.
 """
 
 from __future__ import annotations
@@ -9,26 +10,39 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import platform
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.records import ENDED, FAILED
-from acmr.storage.json_files import replace_json
+from acmr.records import ENDED, FAILED, RUNNING, STOPPED, DamagedError
+from acmr.storage.durable import WriteError, read_regular
+from acmr.storage.json_files import write_json
+from acmr.storage.processes import is_alive
 
 SWEEPS = ".sweeps"
 #: What a training printed, in its run's directory.
 OUTPUT_FILE = "output.log"
 #: State of a run of a sweep, beside those that it says itself.
 WAITING = "waiting"
+#: Fields of a run that are words, all others are numbers.
+_TEXTS = ("name", "cell", "directory", "ended")
+_STATES = (WAITING, RUNNING, STOPPED, *ENDED, FAILED)
 #: States that a run does not leave within its sweep.
 FINAL = (*ENDED, FAILED)
 #: Folders of former sweeps that are kept.
 _KEPT = 10
+_PLAN, _SET_ASIDE = "plan.json", "plan.json.damaged"
+#: More than the plan of any sweep takes.
+_MOST_BYTES = 64 << 20
+#: The fields of a plan that have to be of a type, where they are there.
+_KINDS: dict[str, Any] = {
+    "command": str, "retries": int, "grace": int | float, "process": int, "host": str, "order": list, "runs": list,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -81,6 +95,7 @@ class SweepFolder:
         self.conf = path / "conf"
         self.output_dir = path.parent.parent
         self._held: int | None = None
+        self._plan: dict[str, Any] | None = None
 
     @classmethod
     def create(
@@ -97,36 +112,68 @@ class SweepFolder:
         """
         identity = f"{time.strftime('%Y%m%d-%H%M%S')}-{time.time_ns() // 1000 % 1_000_000:06}"
         folder = cls((output_dir / SWEEPS / identity).absolute())
-        for name in ("jobs", "states", "claims"):
+        for name in ("jobs", "states", "claims", "begun"):
             (folder.path / name).mkdir(parents=True)
         shutil.copytree(conf, folder.conf)
         folder._hold()
         content = {
             **header,
             "process": os.getpid(),
+            "host": platform.node(),
             "order": list(order),
             "runs": [asdict(entry) for entry in entries],
         }
-        replace_json(folder.path / "plan.json", content)
+        write_json(folder.path / _PLAN, content)
         for old in all_folders(output_dir)[:-_KEPT]:
             if not old.is_alive():
                 shutil.rmtree(old.path, ignore_errors=True)
         return folder
 
     def header(self) -> dict[str, Any]:
-        """The whole plan as it was stored."""
-        content = json.loads((self.path / "plan.json").read_text(encoding="utf-8"))
-        assert isinstance(content, dict)
-        return content
+        """The whole plan as it was stored.
+
+        Raises:
+            DamagedError: If it cannot be read, or is no plan.
+        """
+        if self._plan is None:
+            path = self.path / _PLAN
+            content = _read(path)
+            odd = [key for key, kind in _KINDS.items() if key in content and not isinstance(content[key], kind)]
+            if odd or "runs" not in content:
+                raise DamagedError(f"{path}: no plan of a sweep ({(odd or ['runs'])[0]})")
+            self._plan = content
+        return self._plan
 
     def entries(self) -> list[SweepRun]:
-        """All runs of the sweep."""
-        return [SweepRun(**run) for run in self.header()["runs"]]
+        """All runs of the sweep.
+
+        Raises:
+            DamagedError: If the plan cannot be read, or has something else in their place.
+        """
+        return [_entry(self.path / _PLAN, index, run) for index, run in enumerate(self.header()["runs"])]
 
     def is_alive(self) -> bool:
         """Whether its process is still there."""
-        with _locked(self.path / "alive") as free:
-            return not free
+        try:
+            with _locked(self.path / "alive") as free:
+                return not free
+        except OSError:
+            # A file system without locks, or no file: the plan says whose it is.
+            with suppress(DamagedError):
+                plan = self.header()
+                return is_alive(int(plan.get("process", 0)), str(plan.get("host", platform.node())))
+            return False
+
+    def set_aside(self, why: str, warn: Callable[[str], None]) -> None:
+        """Says that the plan cannot be read, and takes it away if its sweep is over, so that it is said once."""
+        if self.is_alive():
+            warn(f"warning: {why}; the sweep is still at work, and is passed over here")
+            return
+        with suppress(OSError):
+            os.replace(self.path / _PLAN, self.path / _SET_ASIDE)
+            warn(f"warning: {why}; that sweep is over, and its plan is set aside as {_SET_ASIDE}")
+            return
+        warn(f"warning: {why}; that sweep is over, and is passed over")
 
     def release(self) -> None:
         """Says that the sweep is over before its process is."""
@@ -137,22 +184,25 @@ class SweepFolder:
     def _hold(self) -> None:
         # A lock, because a process number may soon belong to somebody else, and because other machines see it too.
         self._held = os.open(self.path / "alive", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        fcntl.flock(self._held, fcntl.LOCK_EX)
+        with suppress(OSError):
+            fcntl.flock(self._held, fcntl.LOCK_EX)
 
     def job_file(self, index: int) -> Path:
         """Where the settings of a run are."""
         return self.path / "jobs" / f"{index:05d}.json"
 
     def state(self, index: int) -> State:
-        """What has become of a run."""
-        try:
-            return State(**json.loads(self._state_file(index).read_text(encoding="utf-8")))
-        except FileNotFoundError:
-            return State()
+        """What has become of a run; it waits where nothing is said that can be read."""
+        with suppress(DamagedError):
+            said = _read(self._state_file(index))
+            state, failures, reason = said.get("state"), said.get("failures"), said.get("reason")
+            if state in _STATES and type(failures) is int and 0 <= failures < 1_000_000 and isinstance(reason, str):
+                return State(state, failures, reason)
+        return State()
 
     def set_state(self, index: int, state: State) -> None:
         """Notes what has become of a run."""
-        replace_json(self._state_file(index), asdict(state))
+        write_json(self._state_file(index), asdict(state))
 
     def _state_file(self, index: int) -> Path:
         return self.path / "states" / f"{index:05d}.json"
@@ -160,8 +210,23 @@ class SweepFolder:
     @contextmanager
     def claim(self, index: int) -> Iterator[bool]:
         """Takes a run for this process, unless another has it; it is free again when the process ends, however."""
-        with _locked(self.path / "claims" / f"{index:05d}") as mine:
+        with ExitStack() as stack:
+            try:
+                mine = stack.enter_context(_locked(self.path / "claims" / f"{index:05d}"))
+            except OSError:
+                # Where nothing can be locked, the run's own directory tells a second worker that it is held.
+                mine = True
             yield mine
+
+    def note_begun(self, index: int) -> None:
+        """Records that a run which is to be made anew has been begun anew in this sweep."""
+        # Should it be lost, another attempt begins once more.
+        with suppress(WriteError):
+            write_json(self.path / "begun" / f"{index:05d}.json", {})
+
+    def has_begun(self, index: int) -> bool:
+        """Whether that was recorded."""
+        return (self.path / "begun" / f"{index:05d}.json").exists()
 
     def stop(self, at_once: bool) -> None:
         """Tells every worker to end its training: after a checkpoint, or at once."""
@@ -179,16 +244,52 @@ class SweepFolder:
         return (self.path / "kill").exists()
 
 
-def all_folders(output_dir: Path) -> list[SweepFolder]:
-    """The folders of all sweeps that are kept, the newest last."""
-    found = sorted((output_dir / SWEEPS).glob("*/plan.json"), key=lambda path: path.stat().st_mtime_ns)
-    return [SweepFolder(path.parent) for path in found]
+def all_folders(output_dir: Path, warn: Callable[[str], None] = lambda line: None) -> list[SweepFolder]:
+    """The folders of all sweeps that are kept and whose plan can be read, the newest last.
+
+    Args:
+        output_dir: The folder of all runs.
+        warn: Told of each whose plan cannot be read.
+    """
+    found = []
+    for place in (output_dir / SWEEPS).glob("*"):
+        folder, path = SweepFolder(place), place / _PLAN
+        try:
+            if os.path.lexists(path) and folder.entries() is not None:
+                found.append((path.stat().st_mtime_ns, folder))
+        except (DamagedError, OSError) as error:
+            folder.set_aside(f"{path}: {error.strerror}" if isinstance(error, OSError) else str(error), warn)
+    return [folder for _, folder in sorted(found, key=lambda pair: pair[0])]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(read_regular(path, _MOST_BYTES))
+    except (ValueError, RecursionError):
+        raise DamagedError(f"{path}: cannot be read") from None
+    if not isinstance(content, dict):
+        raise DamagedError(f"{path}: cannot be read")
+    return content
+
+
+def _entry(path: Path, index: int, run: Any) -> SweepRun:
+    """A run of a plan, every field of its type; runs lie within the folder of all runs."""
+    with suppress(TypeError, ValueError):
+        entry = SweepRun(**run)
+        values = {**asdict(entry), "teacher": entry.teacher or 0, "cell": entry.cell or "", "ended": entry.ended or ""}
+        typed = all(type(value) is (str if key in _TEXTS else int) for key, value in values.items())
+        if typed and min(entry.index, entry.seed, entry.threads, values["teacher"]) >= 0:
+            place = Path(entry.directory)
+            inside = len(place.parts) > 1 and not place.is_absolute() and not {"..", "\0"} & {*place.parts, *str(place)}
+            if inside and (entry.teacher is None or entry.teacher < index):
+                return entry
+    raise DamagedError(f"{path}: no plan of a sweep (run {index})")
 
 
 @contextmanager
 def _locked(path: Path) -> Iterator[bool]:
     """Whether a file's lock could be had; the lock goes with the process that has it, however that ends."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o644)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield True

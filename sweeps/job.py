@@ -16,13 +16,17 @@ from pathlib import Path
 from typing import IO
 
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from acmr.config import ExperimentConfig
-from acmr.records import CONFIG_FILE
+from acmr.config import ConfigError, ExperimentConfig
+from acmr.records import DamagedError
 from acmr.settings.compose import look_in
 from acmr.settings.run_spec import RunSpec
 from acmr.settings.sources import stored_sources
-from acmr.storage.json_files import replace_json
+from acmr.storage.durable import read_regular
+from acmr.storage.json_files import write_json
+from acmr.text import one_line
+from sweeps.folder import SweepFolder
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 #: Environment variable with the process that a training must not outlive.
@@ -32,40 +36,51 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: Seconds that a training has for its checkpoint when its worker has gone.
 ORPHAN_GRACE = 20.0
 _POLL = 0.25
+#: More than the settings of any run take.
+_MOST_BYTES = 16 << 20
 _SET_DEATH_SIGNAL = 1
 
 
 def write_job(path: Path, spec: RunSpec) -> None:
     """Stores a run with everything that follows from its settings, so that it needs no settings file any more."""
     content = {"config": asdict(spec.config), "changes": spec.changes, "name": spec.name, "cell": spec.cell}
-    replace_json(path, content)
+    write_json(path, content)
 
 
 def read_job(path: Path) -> RunSpec:
     """Reads what :func:`write_job` stored."""
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = json.loads(read_regular(path, _MOST_BYTES))
     config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ExperimentConfig), content["config"]))
     assert isinstance(config, ExperimentConfig)
     return RunSpec(config, content["changes"], content["name"], content["cell"])
 
 
-def adopt(path: Path) -> RunSpec:
+def adopt(path: Path) -> tuple[RunSpec, Callable[[], None]]:
     """Makes this process the training of a job: with the settings of the sweep's start, and no longer than its worker.
 
     Args:
         path: A file of :func:`write_job`, within a sweep's folder.
+
+    Returns:
+        The run, and what to call once it has been begun from its first step.
+
+    Raises:
+        ConfigError: If the file cannot be read.
     """
     _die_with_parent(int(os.environ.pop(PARENT, os.getppid())))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
     # The student's teacher follows from these files, which nobody edits.
     folder = path.parent.parent
-    look_in(stored_sources(folder, folder / "conf"))
-    spec = read_job(path)
-    begun, planned = spec.directory / CONFIG_FILE, folder / "plan.json"
-    if begun.exists() and begun.stat().st_mtime_ns > planned.stat().st_mtime_ns:
+    try:
+        look_in(stored_sources(folder, folder / "conf"))
+        spec = read_job(path)
+    except (DamagedError, OSError, ValueError, LookupError, TypeError, RecursionError, OmegaConfBaseException) as error:
+        raise ConfigError(f"{path}: damaged ({one_line(error)}); start the sweep's command again") from error
+    sweep, index = SweepFolder(folder), int(path.stem)
+    if sweep.has_begun(index):
         # This sweep has begun it anew already; to be asked for once is to be done once.
         spec = replace(spec, config=replace(spec.config, force=False))
-    return spec
+    return spec, lambda: sweep.note_begun(index)
 
 
 class TrainingProcess:

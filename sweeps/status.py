@@ -36,7 +36,7 @@ def all_runs(output_dir: Path, folders: Iterable[RunFolder]) -> list[RunStatus]:
 
 
 def _planned(output_dir: Path) -> list[RunStatus]:
-    folders = all_folders(output_dir)
+    folders = all_folders(output_dir, lambda line: print(terminal(line), file=sys.stderr))
     known: dict[Path, RunStatus] = {}
     for folder in folders:
         entries = folder.entries()

@@ -22,6 +22,7 @@ from acmr.settings.compose import CONFIG_FOLDER, groups, look_in, setting_keys, 
 from acmr.settings.errors import FREE_KEYS
 from acmr.settings.files import place_of_text
 from acmr.settings.sources import sources_of
+from acmr.storage.durable import WriteError
 from acmr.text import one_line
 from sweeps.display import Display, print_plan
 from sweeps.estimate import estimate
@@ -81,8 +82,9 @@ def run_sweep(jobs: Sequence[Sequence[str]], settings: Settings, config: DictCon
     if not plan.missing:
         print(f"{len(plan.runs)} of {len(plan.runs)} runs complete: {_places(plan)}")
         return 0
-    _refuse_overlap(plan, output_dir)
-    adapter.clear(all_folders(output_dir))
+    folders = all_folders(output_dir, lambda line: print(line, file=sys.stderr))
+    _refuse_overlap(plan, output_dir, folders)
+    adapter.clear(folders)
     return Sweep(plan, output_dir, settings, adapter).run()
 
 
@@ -98,8 +100,10 @@ class Sweep:
 
     def __init__(self, plan: Plan, output_dir: Path, settings: Settings, adapter: LauncherAdapter) -> None:
         self._plan, self._settings, self._adapter = plan, settings, adapter
+        # Kept here, too: what becomes of the sweep's folder is no reason to forget it.
+        self._typed = shlex.join(["python", *_typed()])
         header = {
-            "command": shlex.join(["python", *_typed()]),
+            "command": self._typed,
             "retries": settings.retries,
             "grace": settings.grace,
         }
@@ -110,10 +114,9 @@ class Sweep:
             sources().store(self._folder.path, self._folder.conf)
             for run in plan.missing:
                 write_job(self._folder.job_file(run.index), run.spec)
-        except OSError as error:
-            raise ConfigError(
-                f"output_dir={output_dir}: cannot be written ({error.strerror}); type output_dir=FOLDER"
-            ) from error
+        except (OSError, WriteError) as error:
+            why = error.strerror if isinstance(error, OSError) else error
+            raise ConfigError(f"output_dir={output_dir}: cannot be written ({why}); type output_dir=FOLDER") from error
         self._output_dir = output_dir
         self._signal: int | None = None
         self._abandoned = False
@@ -222,7 +225,7 @@ class Sweep:
         return 1 if failed or any(view.state not in FINAL for view in display.views) else 0
 
     def _command(self) -> str:
-        return str(self._folder.header()["command"])
+        return self._typed
 
 
 def entries_of(plan: Plan, output_dir: Path) -> list[SweepRun]:
@@ -275,13 +278,13 @@ def _check(settings: Settings) -> None:
         raise ConfigError(f"hydra.sweeper.grace={settings.grace}: a number of seconds is needed")
 
 
-def _refuse_overlap(plan: Plan, output_dir: Path) -> None:
+def _refuse_overlap(plan: Plan, output_dir: Path, folders: Sequence[SweepFolder]) -> None:
     """Two sweeps on the same runs would only wait for one another."""
     wanted = {entry.directory for entry in entries_of(plan, output_dir) if entry.ended is None}
-    for folder in all_folders(output_dir):
+    for folder in folders:
         common = [entry for entry in folder.entries() if entry.directory in wanted and entry.ended is None]
         if common and folder.is_alive():
-            process = folder.header()["process"]
+            process = folder.header().get("process")
             raise ConfigError(
                 f"{output_dir / common[0].directory}: process {process} has it in its sweep; "
                 f"wait for that, or end it: kill {process}"

@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 
 from acmr.command import command
 from acmr.config import ConfigError
-from acmr.records import COMPLETE, ENDED, FAILED, RUNNING, STOPPED
+from acmr.records import COMPLETE, ENDED, FAILED, RUNNING, STOPPED, DamagedError
 from acmr.storage.run_dir import RunDir
 from sweeps.folder import FINAL, OUTPUT_FILE, State, SweepFolder, SweepRun
 from sweeps.job import STOP_SIGNALS, TrainingProcess
@@ -61,9 +61,11 @@ class Worker:
 
     def __init__(self, folder: SweepFolder, parent: int) -> None:
         self._folder, self._parent = folder, parent
-        header = folder.header()
-        self._order: list[int] = header["order"]
-        self._entries = [SweepRun(**run) for run in header["runs"]]
+        try:
+            header, self._entries = folder.header(), folder.entries()
+        except DamagedError as error:
+            raise ConfigError(f"{error}; start the sweep's command again") from error
+        self._order: list[int] = [index for index in header["order"] if index in range(len(self._entries))]
         self._retries, self._grace = int(header["retries"]), float(header["grace"])
 
     def take_next(self) -> bool:

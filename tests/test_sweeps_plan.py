@@ -245,14 +245,19 @@ def test_a_run_that_is_to_be_made_anew_is_begun_anew_once(tmp_path, out):
     (run,) = plan([out, "force=true"]).runs
     folder = SweepFolder.create(tmp_path, {}, [], [], CONFIG_FOLDER)
     write_job(folder.job_file(0), run.spec)
-    code = "from pathlib import Path; from sweeps.job import adopt; print(adopt(Path({!r})).config.force)"
+    code = (
+        "import sys; from pathlib import Path; from sweeps.job import adopt; spec, begun = adopt(Path({!r}))\n"
+        "print(spec.config.force); begun() if sys.argv[1:] else None"
+    )
     command = [sys.executable, "-c", code.format(str(folder.job_file(0)))]
 
-    def forced() -> str:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    def forced(*begin: str) -> str:
+        return subprocess.run([*command, *begin], capture_output=True, text=True, check=True).stdout.strip()
 
     finish(run.spec)
-    os.utime(run.spec.directory / "config.yaml", (1, 1))
-    assert forced() == "True"
-    finish(run.spec, "")
+    # Whatever clock wrote it: from the past, or from a machine whose clock is ahead.
+    for clock in (1, time.time() + 86_400, 2**33):
+        os.utime(run.spec.directory / "config.yaml", (clock, clock))
+        assert forced() == "True"
+    assert forced("begun") == "True"
     assert forced() == "False"

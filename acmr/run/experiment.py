@@ -26,12 +26,15 @@ from acmr.tracking.watchers import make_watchers
 from acmr.transfer.teacher import save_teacher
 
 
-def run_experiment(spec: RunSpec, say: Callable[[str], None] = print) -> dict[str, Any]:
+def run_experiment(
+    spec: RunSpec, say: Callable[[str], None] = print, begun: Callable[[], None] = lambda: None
+) -> dict[str, Any]:
     """Trains what ``spec`` describes, from where it was left, unless that has been done.
 
     Args:
         spec: The run.
         say: Where lines for the user go.
+        begun: Called once the run has been begun from its first step, and nothing is left of what was there.
 
     Returns:
         The run's summary, as in ``summary.json``; its ``status`` is ``complete`` or ``diverged``.
@@ -54,7 +57,7 @@ def run_experiment(spec: RunSpec, say: Callable[[str], None] = print) -> dict[st
             if done is not None:
                 return done
             with StopSignals() as stop, no_log_file():
-                return Session(prepared, run_dir, stop, say).run()
+                return Session(prepared, run_dir, stop, say, begun).run()
     except WriteError as error:
         raise StorageError(run_dir.path, error) from error
 
@@ -86,6 +89,7 @@ class Session:
     run_dir: RunDir
     stop: StopSignals
     say: Callable[[str], None]
+    begun: Callable[[], None]
     _settings: FileDigest = field(init=False)
 
     def run(self) -> dict[str, Any]:
@@ -117,6 +121,7 @@ class Session:
             checkpoints.clear()
             run_dir.start(spec.settings)
             state.logs.begin()
+            self.begun()
         if not run_dir.transfer_file.exists():
             run_dir.write_json(run_dir.transfer_file, asdict(self.prepared.report))
         self._settings = run_dir.settings_digest()
