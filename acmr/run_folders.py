@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from acmr.foreign import most_of
 from acmr.records import EPISODE_FILES, FILES_ENTRY, SEAL_ENTRY, SEALED_FILES, SEED_FOLDER, SUMMARY_FILE
 
 #: Folders that hold other files of the same names (of W&B, Python); those whose name begins with a dot are, too.
@@ -170,7 +171,7 @@ def _seal(content: Mapping[str, Any]) -> str:
 def _change(directory: Path, name: str, digest: Any) -> str:
     """What is wrong with a file; empty if nothing is."""
     size, sha256 = (digest.get("size"), digest.get("sha256")) if isinstance(digest, Mapping) else (None, None)
-    if not isinstance(size, int) or not isinstance(sha256, str):
+    if not isinstance(size, int) or not isinstance(sha256, str) or size > most_of(name):
         return f"{SUMMARY_FILE} does not say what {name} was"
     path, packed = directory / name, directory / f"{name}.gz"
     is_packed = not os.path.lexists(path) and os.path.lexists(packed)

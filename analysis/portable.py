@@ -8,12 +8,12 @@ from typing import Any
 
 import yaml
 
+from acmr.foreign import parse_mapping
 from acmr.records import (
     CONFIG_FILE,
     DESCRIPTION_FILE,
     EVALUATION_FILE,
     TRANSFER_FILE,
-    DamagedError,
     description_sha256,
     portable,
     portable_settings,
@@ -34,12 +34,7 @@ def portable_file(name: str, data: bytes) -> bytes:
     """
     if name not in (CONFIG_FILE, DESCRIPTION_FILE, TRANSFER_FILE, EVALUATION_FILE):
         return data
-    try:
-        content = yaml.safe_load(data) if name == CONFIG_FILE else json.loads(data)
-    except (ValueError, yaml.YAMLError, RecursionError):
-        raise DamagedError(f"{name}: cannot be read") from None
-    if not isinstance(content, Mapping):
-        raise DamagedError(f"{name}: holds no settings")
+    content = parse_mapping(name, data)
     told = _told(name, content)
     if told == content:
         return data

@@ -22,6 +22,7 @@ from typing import Any
 from acmr.cells import CELLS
 from acmr.command import command
 from acmr.config import THRESHOLD
+from acmr.foreign import is_there, read_bytes, read_mapping
 from acmr.names import terminal
 from acmr.records import (
     COMPLETE,
@@ -89,7 +90,7 @@ def publish(runs: Path, out: Path, say: Callable[[str], None] = _silent, trust: 
         PublishError: If there is nothing to publish, ``out`` holds other results of a run, or it would become too
             large; then nothing is written.
     """
-    folders = [folder.path for folder in run_folders(runs) if (folder.path / SUMMARY_FILE).is_file()]
+    folders = [folder.path for folder in run_folders(runs) if is_there(folder.path / SUMMARY_FILE)]
     with tempfile.TemporaryDirectory() as scratch:
         found = {
             path.relative_to(runs): files
@@ -119,18 +120,18 @@ def publish(runs: Path, out: Path, say: Callable[[str], None] = _silent, trust: 
 def _files(run: Path, target: Path, scratch: Path) -> dict[str, bytes]:
     """Names and contents of what is published of a run, but for its evaluation; nothing if it has not ended."""
     try:
-        summary = json.loads((run / SUMMARY_FILE).read_text(encoding="utf-8"))
-    except ValueError:
-        raise PublishError(f"{run / SUMMARY_FILE}: cannot be read; move that run away, or make it anew") from None
+        summary = read_mapping(run / SUMMARY_FILE)
+    except DamagedError as error:
+        raise PublishError(f"{error}; move that run away, or make it anew") from None
     if ended_state(summary) is None:
         return {}
     if changed := changes(run, summary):
         raise PublishError(f"{run}: {'; '.join(changed.values())}; put back what the run wrote, or make it anew")
-    files = dict(_packed(run / name) for name in RECORDS if (run / name).is_file())
+    files = dict(_packed(run / name) for name in RECORDS if is_there(run / name))
     files[SUMMARY_FILE] = _resealed(summary, files)
     # The networks of a run that diverged are of no use.
-    if ended_state(summary) == COMPLETE and all((run / name).is_file() for name in NETWORKS):
-        is_full = _teaches(summary) or (run / TENSOR_FILE).stat().st_size <= LARGE
+    if ended_state(summary) == COMPLETE and all(is_there(run / name) for name in NETWORKS):
+        is_full = _teaches(summary) or len(_portable(run / TENSOR_FILE)) <= LARGE
         source = run if is_full else _halved(run, target, scratch)
         files |= {name: _portable(source / name) for name in NETWORKS}
     return files
@@ -199,10 +200,9 @@ def _run(module: str, *arguments: str) -> str:
 def _json(path: Path) -> dict[str, Any]:
     """Contents of a JSON file; empty if it is not there or holds no mapping."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_mapping(path)
+    except DamagedError:
         return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _bytes_of(files: dict[str, bytes], names: list[str]) -> int:
@@ -232,7 +232,7 @@ def _packed(path: Path) -> tuple[str, bytes]:
 def _portable(path: Path) -> bytes:
     """What is published of a file: nothing that only concerns this machine."""
     try:
-        return portable_file(path.name, path.read_bytes())
+        return portable_file(path.name, read_bytes(path, title=path.name))
     except DamagedError as error:
         raise PublishError(f"{path.parent}: {error}; move that run away, or make it anew") from None
 
@@ -240,13 +240,15 @@ def _portable(path: Path) -> bytes:
 def _other(path: Path, data: bytes) -> bool:
     """Whether something else lies there; what earlier versions have published says more of the machine."""
     try:
-        return path.exists() and portable_file(path.name, path.read_bytes()) != data
+        return is_there(path) and portable_file(path.name, read_bytes(path)) != data
     except DamagedError:
         return True
 
 
 def _write(path: Path, data: bytes) -> None:
     unfinished = path.with_name(f".{path.name}.tmp")
+    # A link of that name would be written through.
+    unfinished.unlink(missing_ok=True)
     unfinished.write_bytes(data)
     os.replace(unfinished, path)
 

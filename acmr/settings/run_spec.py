@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import json
+import re
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,13 @@ from acmr.config import (
     is_neutral,
     plain_settings,
 )
-from acmr.records import DESCRIPTION_FILE
+from acmr.foreign import DESCRIPTIONS, read_mapping
+from acmr.records import DESCRIPTION_FILE, DamagedError
 from acmr.settings.compose import as_override, baseline, compose_config, env_overrides, parse, sources
 
 #: Settings that a run's name spells out in its own way.
 _NAMED_KEYS = ("seed", "freeze", "agent.name", "transfer.name", "transfer.teacher", "env.name")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 #: What stands in a method's file only.
 _RULES = "transfer.rules."
 
@@ -128,9 +131,12 @@ def _short_overrides(spec: RunSpec) -> list[str]:
 
 def _teacher_mark(path: str) -> str:
     given = Path(path)
+    given = given.resolve() if given.is_symlink() else given
     beside = given / DESCRIPTION_FILE if given.is_dir() else given.with_suffix(".json")
-    try:
-        return str(json.loads(beside.read_text(encoding="utf-8"))["sha256"])[:8]
-    except (OSError, ValueError, KeyError, TypeError):
-        # Loading the teacher will say what is wrong with it; until then its path identifies it.
-        return digest(path)
+    with suppress(DamagedError):
+        said = read_mapping(beside, most=DESCRIPTIONS).get("sha256")
+        # It becomes a part of the run's name, and so of a path.
+        if isinstance(said, str) and _SHA256.fullmatch(said):
+            return said[:8]
+    # Loading the teacher will say what is wrong with it; until then its path identifies it.
+    return digest(path)

@@ -21,6 +21,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
+from acmr.foreign import parse_mapping
 from acmr.records import DamagedError
 from acmr.storage.durable import (
     FileDigest,
@@ -119,10 +120,10 @@ class SnapshotStore:
         if head != _head(body):
             raise _not_as_written(path, head)
         try:
-            content = json.loads(body)
+            content = parse_mapping(path.name, body)
             digest = FileDigest.from_json(content["arrays"])
             values = dict(content["values"])
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, DamagedError) as error:
             raise DamagedError(f"{path}: not a checkpoint of this program") from error
         if digest.size > self._limit:
             raise DamagedError(f"{path}: not a checkpoint of this run")

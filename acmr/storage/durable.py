@@ -12,7 +12,6 @@ import errno
 import hashlib
 import os
 import re
-import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from acmr.config import ConfigError
+from acmr.foreign import opened
 from acmr.records import DamagedError
 from acmr.storage.hold import check_hold
 
@@ -218,17 +218,10 @@ def read_regular(path: Path, limit: int | None, count: int = -1) -> bytes:
     Raises:
         DamagedError: If it is missing, unreadable, no regular file, or larger.
     """
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-        with open(descriptor, "rb") as stream:
-            status = os.fstat(descriptor)
-            if not stat.S_ISREG(status.st_mode):
-                raise DamagedError(f"{path}: no regular file")
-            if limit is not None and status.st_size > limit:
-                raise DamagedError(f"{path}: {status.st_size} bytes, at most {limit} expected")
-            return stream.read(min(count, status.st_size) if count >= 0 else -1)
-    except OSError as error:
-        raise DamagedError(f"{path}: {error.strerror or error}") from error
+    with opened(path, links=False) as (stream, size):
+        if limit is not None and size > limit:
+            raise DamagedError(f"{path}: {size} bytes, at most {limit} expected")
+        return stream.read(min(count, size) if count >= 0 else -1)
 
 
 def _write(descriptor: int, path: Path, data: bytes) -> None:

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from acmr.foreign import read_mapping
+from acmr.records import DamagedError
 from acmr.storage.durable import write_bytes
 from acmr.storage.hold import check_hold
 
@@ -40,7 +42,6 @@ def replace_json(path: Path, content: Mapping[str, Any]) -> None:
 def read_json(path: Path) -> dict[str, Any] | None:
     """What a file says that others write; None if it is not there, not readable or no object."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return read_mapping(path)
+    except DamagedError:
         return None
-    return content if isinstance(content, dict) else None

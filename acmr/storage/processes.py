@@ -14,6 +14,9 @@ def is_alive(process: int, host: str) -> bool:
     """Whether a process is still there; of another machine nothing is known, so that its processes count as alive."""
     if host != platform.node():
         return True
+    # Others mean groups of processes, or nothing; a status file may hold any number.
+    if not 0 < process < 1 << 31:
+        return False
     try:
         os.kill(process, 0)
     except ProcessLookupError:

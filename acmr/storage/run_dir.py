@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import time
@@ -15,6 +14,7 @@ from typing import Any
 import yaml
 
 from acmr.config import ConfigError, ExperimentConfig, differing_keys
+from acmr.foreign import SETTINGS, is_there, read_mapping
 from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
@@ -57,8 +57,6 @@ _RESULTS = (
     DESCRIPTION_FILE,
     EVALUATION_FILE,
 )
-#: A settings file or a summary larger than this is not one of ours.
-_MAX_BYTES = 1 << 20
 
 
 class RunDir:
@@ -106,19 +104,18 @@ class RunDir:
             ConfigError: If it cannot be read.
         """
         try:
-            return FileDigest.of(read_regular(self.config_file, _MAX_BYTES))
+            return FileDigest.of(read_regular(self.config_file, SETTINGS))
         except DamagedError as error:
             raise ConfigError(f"{error}; type force=true to run it anew") from error
 
     def stored_settings(self) -> dict[str, Any] | None:
         """The settings it was started with; None if there are none yet."""
-        if not _is_there(self.config_file):
+        if not is_there(self.config_file):
             return None
         try:
-            content = yaml.load(read_regular(self.config_file, _MAX_BYTES), _PlainLoader)
-        except (yaml.YAMLError, ValueError, RecursionError, DamagedError) as error:
+            return read_mapping(self.config_file)
+        except DamagedError as error:
             raise ConfigError(f"{self.config_file}: not readable; type force=true to run it anew") from error
-        return content if isinstance(content, dict) else {}
 
     def start(self, settings: Mapping[str, Any]) -> None:
         """Clears what an unfinished or repeated run left, and stores the settings."""
@@ -136,13 +133,12 @@ class RunDir:
         Raises:
             ConfigError: If it cannot be read.
         """
-        if not _is_there(path):
+        if not is_there(path):
             return None
         try:
-            content = json.loads(read_regular(path, _MAX_BYTES))
-        except (ValueError, RecursionError, DamagedError) as error:
+            return read_mapping(path, path.name)
+        except DamagedError as error:
             raise ConfigError(f"{path}: damaged ({error}); type force=true to run it anew") from error
-        return content if isinstance(content, dict) else None
 
     def write_json(self, path: Path, content: Mapping[str, Any]) -> None:
         """Writes a JSON file whole or not at all."""
@@ -248,19 +244,3 @@ def holds_run(run_dir: RunDir, config: ExperimentConfig) -> bool:
             "type output_dir=FOLDER for another place, or force=true to replace it"
         )
     return True
-
-
-class _PlainLoader(yaml.SafeLoader):
-    """Loads plain data without aliases, with which a small file can describe an enormous tree."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("aliases are not allowed")
-        return super().compose_node(parent, index)
-
-
-def _is_there(path: Path) -> bool:
-    try:
-        return os.path.lexists(path)
-    except (OSError, ValueError):
-        return False

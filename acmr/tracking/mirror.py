@@ -6,20 +6,18 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from acmr.command import command
 from acmr.config import ConfigError
-from acmr.records import CONFIG_FILE, SUMMARY_FILE
+from acmr.foreign import is_there, read_mapping
+from acmr.records import CONFIG_FILE, SUMMARY_FILE, DamagedError
 from acmr.settings.compose import compose_config, options, parse
 from acmr.settings.run_spec import RunSpec
 from acmr.settings.stored import stored_config
@@ -27,7 +25,7 @@ from acmr.settings.validate import check_address
 from acmr.text import message
 from acmr.tracking.observer import Say
 from acmr.tracking.wandb_backend import linked_mirrors, server_problem, wandb_environment
-from acmr.tracking.watchers import make_tracker, replay
+from acmr.tracking.watchers import make_tracker, recorded, replay
 
 _EXAMPLE = "runs/paper/armless_humanoid-hidden-frozen/seed_3"
 
@@ -47,16 +45,18 @@ def rebuild(run_dir: Path, tracking: str, say: Say, folder: str | None = None) -
     """
     run_dir = run_dir.resolve()
     try:
-        config = stored_config(yaml.safe_load((run_dir / CONFIG_FILE).read_text()))
+        config = stored_config(read_mapping(run_dir / CONFIG_FILE, CONFIG_FILE))
         summary = _summary(run_dir)
-    except (OSError, yaml.YAMLError, ValueError) as error:
+        # All of it before what there is of the mirror is removed.
+        events = recorded(run_dir)
+    except (DamagedError, ConfigError) as error:
         raise ConfigError(f"{run_dir} is no run's directory ({message(error)}); give one as in {_EXAMPLE}") from error
     chosen = parse(compose_config([f"tracking={tracking}", "tracking.base_url=null"])).tracking
     own = replace(config.tracking, tracker=chosen.tracker, options=chosen.options, base_url=None, dir=folder)
     # What is removed and written lies where the run does, whatever its files say.
     config = replace(config, tracking=own, **_place(run_dir, config.seed))
-    tracker = make_tracker(RunSpec(config, {}, run_dir.parent.name, summary.get("cell") if summary else None), say)
-    replay(tracker, run_dir)
+    tracker = make_tracker(RunSpec(config, {}, run_dir.parent.name, _cell(summary)), say)
+    replay(tracker, events)
     tracker.close(summary)
 
 
@@ -159,9 +159,14 @@ def _place(run_dir: Path, seed: int) -> dict[str, Any]:
     return {"output_dir": str(run_dir.parents[2]), "profile": run_dir.parents[1].name}
 
 
+def _cell(summary: Mapping[str, Any] | None) -> str | None:
+    said = (summary or {}).get("cell")
+    return said if isinstance(said, str) else None
+
+
 def _summary(run_dir: Path) -> dict[str, Any] | None:
     file = run_dir / SUMMARY_FILE
-    return json.loads(file.read_text()) if file.exists() else None
+    return read_mapping(file, SUMMARY_FILE) if is_there(file) else None
 
 
 def _is_sent(file: Path) -> bool:

@@ -6,16 +6,18 @@ None of it can end a training, and each is told first what the run has recorded 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+import io
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from heapq import merge
 from importlib import import_module
 from pathlib import Path
 
 from acmr.config import ConfigError, TrackingConfig
-from acmr.records import EPISODES_FILE, METRICS_FILE, EpisodeRecord
+from acmr.foreign import is_there, read_bytes
+from acmr.records import EPISODE_COLUMNS, EPISODES_FILE, METRICS_FILE, DamagedError, EpisodeRecord
 from acmr.settings.run_spec import RunSpec
-from acmr.text import one_line
+from acmr.text import message, one_line
 from acmr.tracking.observer import Guarded, Observer, Say, Tracker
 from acmr.tracking.progress import RunProgress, make_progress
 from acmr.tracking.status_file import StatusFile
@@ -34,8 +36,13 @@ def make_watchers(spec: RunSpec, start_step: int, say: Say) -> list[Observer]:
         _started(StatusFile.title, partial(StatusFile, spec, start_step), say),
         make_tracker(spec, say),
     ]
+    try:
+        events = recorded(spec.directory)
+    except DamagedError as error:
+        say(f"warning: what was recorded so far is not shown ({error})")
+        events = []
     for watcher in watchers:
-        replay(watcher, spec.directory)
+        replay(watcher, events)
     return watchers
 
 
@@ -71,23 +78,44 @@ def tracker_class(config: TrackingConfig) -> type[Tracker] | None:
     return kind
 
 
-def replay(observer: Observer, run_dir: Path) -> None:
-    """Tells an observer what a run has recorded so far, in the order in which it happened.
+STEP, LENGTH = EPISODE_COLUMNS[0], EPISODE_COLUMNS[2]
+#: What a run has recorded at a step: an episode, or metrics.
+Event = tuple[int, EpisodeRecord | dict[str, float]]
+
+
+def recorded(run_dir: Path) -> list[Event]:
+    """What a run has recorded so far, in the order in which it happened.
+
+    Args:
+        run_dir: The run's directory.
+
+    Raises:
+        DamagedError: If one of its tables holds anything but numbers; a row that a kill tore is left out.
+    """
+    rows = [
+        ((step, 0, row) for step, row in _rows(run_dir / EPISODES_FILE, (STEP, LENGTH))),
+        ((step, 1, row) for step, row in _rows(run_dir / METRICS_FILE, (STEP,))),
+    ]
+    # An episode that ends at a step comes before that step's metrics, as in the run itself.
+    ordered = merge(*rows, key=lambda item: item[:2])
+    try:
+        return [(step, row if kind else EpisodeRecord.from_row(step, row)) for step, kind, row in ordered]
+    except KeyError as error:
+        raise DamagedError(f"{EPISODES_FILE}: a row without {message(error)}") from None
+
+
+def replay(observer: Observer, events: Iterable[Event]) -> None:
+    """Tells an observer what :func:`recorded` found.
 
     Args:
         observer: One that has been told nothing yet.
-        run_dir: The run's directory.
+        events: What to tell.
     """
-    rows = [
-        ((step, 0, row) for step, row in _rows(run_dir / EPISODES_FILE)),
-        ((step, 1, row) for step, row in _rows(run_dir / METRICS_FILE)),
-    ]
-    # An episode that ends at a step comes before that step's metrics, as in the run itself.
-    for step, is_metrics, row in merge(*rows, key=lambda item: item[:2]):
-        if is_metrics:
-            observer.on_metrics(step, row)
+    for step, what in events:
+        if isinstance(what, EpisodeRecord):
+            observer.on_episode(what)
         else:
-            observer.on_episode(EpisodeRecord.from_row(step, row))
+            observer.on_metrics(step, what)
 
 
 def _started(title: str, make: Callable[[], Observer], say: Say) -> Observer:
@@ -98,14 +126,21 @@ def _started(title: str, make: Callable[[], Observer], say: Say) -> Observer:
         return Observer()
 
 
-def _rows(file: Path) -> Iterator[tuple[int, dict[str, float]]]:
-    """Rows of a CSV file whose every field is a number, by global step; a row that a kill tore is left out."""
-    if not file.exists():
-        return
-    with file.open(newline="") as lines:
-        reader = csv.reader(line for line in lines if line.endswith("\n"))
+def _rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, float]]]:
+    """Rows of a CSV file by the first of the columns that count steps; a value that is not there is left out."""
+    if not is_there(file):
+        return []
+    text = read_bytes(file, title=file.name).decode("utf-8", errors="replace")
+    reader = csv.reader(line for line in io.StringIO(text, newline="") if line.endswith("\n"))
+    found = []
+    try:
         header = next(reader, [])
         for fields in reader:
             if len(fields) == len(header):
                 row = {key: float(text) for key, text in zip(header, fields, strict=True) if text}
-                yield int(row.pop("global_step")), row
+                # What cannot be a whole number of steps, or is not there, raises.
+                steps = [int(row[name]) for name in needed]
+                found.append((steps[0], {key: value for key, value in row.items() if key != needed[0]}))
+    except (ValueError, OverflowError, KeyError, csv.Error) as error:
+        raise DamagedError(f"{file.name}: line {reader.line_num} is no row of numbers ({message(error)})") from None
+    return found

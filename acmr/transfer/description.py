@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,7 +9,8 @@ from typing import Any
 
 from acmr.agent.architecture import Architecture, Dimensions
 from acmr.config import ACTIVATIONS, ConfigError
-from acmr.records import description_sha256
+from acmr.foreign import DESCRIPTIONS, read_mapping
+from acmr.records import DamagedError, description_sha256
 
 FORMAT_VERSION = 2
 #: Version 1 knew no statistics.
@@ -19,8 +19,8 @@ _READABLE = (1, FORMAT_VERSION)
 FULL, HALF = "float32", "float16"
 #: Entries of a description that are written only where they say something.
 _OPTIONAL = ("precision", "full_sha256", "statistics")
-#: Descriptions larger than this, and layers wider, are none of ours.
-_MAX_BYTES, _MAX_WIDTH = 4 << 20, 1 << 20
+#: Layers wider than this are none of ours.
+_MAX_WIDTH = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -122,13 +122,11 @@ def read_description(path: Path) -> TeacherDescription:
     Raises:
         ConfigError: If it is damaged, of another format, or says what no run of this project does.
     """
-    if path.stat().st_size > _MAX_BYTES:
-        raise ConfigError(f"{path}: {path.stat().st_size} bytes; not a teacher description of this project")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not readable as JSON ({error})") from error
-    if not isinstance(content, dict) or content.get("format_version") not in _READABLE:
+        content = read_mapping(path, most=DESCRIPTIONS)
+    except DamagedError as error:
+        raise ConfigError(f"{error}; not a teacher description of this project") from error
+    if content.get("format_version") not in _READABLE:
         raise ConfigError(f"{path}: not a teacher description of format {' or '.join(map(str, _READABLE))}")
     names = [entry.name for entry in fields(TeacherDescription) if entry.name not in (*_OPTIONAL, "description_sha256")]
     missing = [name for name in names if name not in content]

@@ -18,13 +18,11 @@ from torch import Tensor
 
 from acmr.agent.networks import Networks
 from acmr.config import ConfigError
-from acmr.records import DESCRIPTION_FILE, TENSOR_FILE, description_sha256
+from acmr.foreign import NETWORKS, is_there, read_bytes
+from acmr.records import DESCRIPTION_FILE, TENSOR_FILE, DamagedError, description_sha256
 from acmr.storage.durable import write_bytes
 from acmr.storage.json_files import write_json
 from acmr.transfer.description import FULL, HALF, TeacherDescription, read_description
-
-#: Tensor files larger than this are none of ours.
-_MAX_TENSOR_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -90,19 +88,23 @@ def load_teacher(path: str | Path) -> Teacher:
         ConfigError: If a file is missing, damaged, of another format, or not what its description says.
     """
     given, path = Path(path), locate_teacher(path)
+    if path.is_symlink() and not given.is_dir():
+        # Typed by the user, so that it may lead anywhere; beside it is what lies beside the file itself.
+        path = path.resolve()
     beside = path.with_suffix(".json")
-    if given.is_dir() and not path.exists():
+    if given.is_dir() and not is_there(path):
         raise ConfigError(
             f"{given}: no {TENSOR_FILE} in it; a run writes it at its end, and not every published run has it"
         )
-    if not path.is_file():
+    if not is_there(path):
         raise ConfigError(f"{path}: no such teacher file; give a finished run's directory or its {TENSOR_FILE}")
-    if not beside.is_file():
+    if not is_there(beside):
         raise ConfigError(f"{path}: {beside.name} is missing beside it; a teacher is both files of a run")
     description = read_description(beside)
-    if path.stat().st_size > _MAX_TENSOR_BYTES:
-        raise ConfigError(f"{path}: {path.stat().st_size} bytes; not the networks of a teacher of this project")
-    data = path.read_bytes()
+    try:
+        data = read_bytes(path, NETWORKS)
+    except DamagedError as error:
+        raise ConfigError(f"{error}; not the networks of a teacher of this project") from error
     if hashlib.sha256(data).hexdigest() != description.sha256:
         raise ConfigError(
             f"{path}: damaged or exchanged (its sha256 is not the one in {beside.name}); "

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gzip
 import io
 import re
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from acmr.foreign import read_bytes, unpack
 from acmr.records import EPISODE_COLUMNS, VELOCITY_COLUMN, DamagedError
 from analysis.loading.csv_table import Table, check_signs, read_table, to_numbers
 
@@ -69,15 +68,8 @@ def read_episodes(path: Path, own: bool = False, ended: bool = False) -> tuple[p
 
 
 def _contents(path: Path) -> bytes:
-    try:
-        if path.suffix == ".gz":
-            with gzip.open(path) as file:
-                return file.read()
-        return path.read_bytes()
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise DamagedError(f"{path.name}: cannot be decompressed ({error})") from None
-    except OSError as error:
-        raise DamagedError(f"{path.name}: {error.strerror or error}") from None
+    data = read_bytes(path, title=path.name)
+    return unpack(data, path.name) if path.suffix == ".gz" else data
 
 
 def _whole_lines(content: bytes) -> tuple[bytes, list[str]]:

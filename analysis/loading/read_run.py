@@ -12,6 +12,7 @@ import pandas as pd
 
 from acmr.cells import stops
 from acmr.config import POLICY, THRESHOLD
+from acmr.foreign import is_there
 from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
@@ -97,7 +98,7 @@ def read_run(root: Path, folder: RunFolder) -> FoundRun:
 
 
 def _episodes(directory: Path, files: RunFiles) -> tuple[pd.DataFrame, list[str]]:
-    path = next((directory / name for name in EPISODE_FILES if (directory / name).is_file()), None)
+    path = next((directory / name for name in EPISODE_FILES if is_there(directory / name)), None)
     if path is None:
         return no_episodes(), [f"no {EPISODES_FILE}"]
     return read_episodes(path, own=files.begun, ended=bool(files.summary))

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from acmr import foreign
+from acmr.foreign import is_there
 from acmr.records import DamagedError
 
 #: Whole numbers from here on are no longer exact as floats, and those of the seeds no longer numbers of 64 bits.
 MOST_STEPS, MOST_SEED = 2**53, 2**63 - 1
-#: Levels of settings within settings.
-_DEEPEST = 30
-#: Bits of a number that can be printed.
-_LONGEST = 4096
 #: Least and most of what a run cannot be used without, and whether it is whole.
 _NEEDED = {
     "seed": (0, MOST_SEED, True),
@@ -31,8 +26,6 @@ _SHOWN = {
     **dict.fromkeys(("wall_seconds", "steps_per_second"), (0, 1e12, False)),
 }
 
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
 
 def read_mapping(path: Path) -> dict[str, Any]:
     """Contents of a YAML or JSON file; empty if there is no such file.
@@ -40,17 +33,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
     Raises:
         DamagedError: If it cannot be read, or holds no settings.
     """
-    if not path.is_file():
-        return {}
-    try:
-        text = path.read_text(encoding="utf-8")
-        value = json.loads(text) if path.suffix == ".json" else _yaml(path.name, text)
-    except (OSError, ValueError, yaml.YAMLError, RecursionError):
-        raise DamagedError(f"{path.name}: cannot be read") from None
-    if not isinstance(value, dict):
-        raise DamagedError(f"{path.name}: holds no settings")
-    _check(path.name, value)
-    return value
+    return foreign.read_mapping(path, path.name) if is_there(path) else {}
 
 
 def check_numbers(name: str, content: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -91,29 +74,3 @@ def _problem(key: str, value: Any, least: float, most: float, whole: bool) -> st
 def _short(value: float) -> str:
     text = str(value)
     return text if len(text) <= 24 else f"{text[:12]}… ({len(text)} characters)"
-
-
-def _check(name: str, value: Any, depth: int = 0) -> None:
-    """Sees that settings can be walked through and printed."""
-    _check_depth(name, depth)
-    if isinstance(value, int) and value.bit_length() > _LONGEST:
-        raise DamagedError(f"{name}: holds a number of more than {_LONGEST} bits")
-    for entry in (*value, *value.values()) if isinstance(value, dict) else value if isinstance(value, list) else ():
-        _check(name, entry, depth + 1)
-
-
-def _yaml(name: str, text: str) -> Any:
-    depth = 0
-    # Looked through first: thousands of levels end the process where they are loaded.
-    for event in yaml.parse(text, _LOADER):
-        # No run writes aliases; in a foreign file they can hold a mapping within itself, or a billion of them.
-        if isinstance(event, yaml.AliasEvent):
-            raise ValueError("aliases")
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        _check_depth(name, depth)
-    return yaml.load(text, _LOADER)
-
-
-def _check_depth(name: str, depth: int) -> None:
-    if depth > _DEEPEST:
-        raise DamagedError(f"{name}: holds settings within settings within settings, more than {_DEEPEST} deep")

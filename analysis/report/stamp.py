@@ -7,7 +7,8 @@ import os
 from pathlib import Path
 
 from acmr import cells
-from acmr.records import STATUS_FILE
+from acmr.foreign import is_there, read_bytes
+from acmr.records import STATUS_FILE, DamagedError
 from analysis.loading.load import RunSet
 from analysis.report.html import RUN_FILES
 
@@ -30,8 +31,11 @@ def fingerprint(data: RunSet, out: Path, settings: dict[str, object]) -> str:
     runs = [data.root / str(run) / name for run in data.runs["directory"] for name in (*RUN_FILES, STATUS_FILE)]
     places = {package: sources, ground: sorted(ground.glob("*.py")), data.root: runs}
     for base, path in [(base, path) for base, paths in places.items() for path in paths]:
-        if path.is_file():
-            content = hashlib.sha256(path.read_bytes()).hexdigest()
+        if is_there(path):
+            try:
+                content = hashlib.sha256(read_bytes(path)).hexdigest()
+            except DamagedError as error:
+                content = str(error)
             digest.update(os.fsencode(f"{path.relative_to(base).as_posix()} {content}\n"))
     return digest.hexdigest()
 
