@@ -1,14 +1,14 @@
-"""Writes the tables of ``docs/results.md`` from the published runs: ``python -m docs.results``.
+"""Writes tables, captions and figures of ``docs/results.md`` from the published runs: ``python -m docs.results``.
 
-Each table stands between two comments with its name; what stands there is replaced. ``tests/test_published.py`` holds
-the page to what this prints.
+Each table and caption stands between two comments with its name; what stands there is replaced.
+``tests/test_published.py`` holds the page to what this prints. The figures are those of ``make paper-figures``.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,18 @@ import pandas as pd
 from acmr.cells import CELLS
 from acmr.records import EVALUATION_FILE, VELOCITY_COLUMN
 from analysis.analyze import Analysis, analyze
+from analysis.figures.paper import FIGURES, save
+from analysis.figures.style import PALETTES, apply
 from analysis.loading.load import load
 from analysis.loading.speed import read_speed
 from analysis.report.published import side_by_side
+from analysis.report.write import figure_data
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, PUBLISHED = ROOT / "docs" / "results.md", ROOT / "results" / "paper"
+IMAGES = ROOT / "docs" / "images" / "results"
+#: Figures on the page.
+PICTURES = ("figure_4", "figure_5", "sensitivity", "kaplan_meier", "training_speed")
 #: Steps at which the first part of learning is looked at, and episodes before each that count.
 _EARLY, _BEFORE = range(25_000, 250_000, 25_000), 20
 #: Width of the parts that a whole run is cut into.
@@ -37,12 +43,21 @@ def tables() -> dict[str, str]:
         "runs": _runs,
         "cells": _cells,
         "comparisons": _comparisons,
+        "replication": _replication,
+        "differences": _sensitivity,
+        "overview": _overview,
+        "paired": _paired,
+        "blocks": _blocks,
+        "equivalence": _equivalence,
+        "cost": _cost,
         "evaluations": _evaluations,
         "early": _early,
         "parts": _parts,
         "speed": _speed,
     }
-    return {name: make(found) for name, make in makers.items()}
+    data = figure_data(found)
+    captions = {spec.name: spec.said(data) for spec in FIGURES if spec.name in PICTURES}
+    return {name: make(found) for name, make in makers.items()} | captions
 
 
 def filled(page: str) -> str:
@@ -57,6 +72,16 @@ def filled(page: str) -> str:
             raise ValueError(f"{PAGE.name} has no place for the table {name}")
         page = place.sub(lambda _, name=name, table=table: f"<!-- {name} -->\n{table}\n<!-- /{name} -->", page)
     return page
+
+
+def draw() -> None:
+    """Draws the figures of the page."""
+    apply()
+    data = figure_data(analyze(load(PUBLISHED)))
+    for spec in FIGURES:
+        figure = spec.draw(data, PALETTES[0]) if spec.name in PICTURES else None
+        if figure is not None:
+            save(figure, IMAGES, spec.name, ("png",))
 
 
 def _ordered(found: Analysis, full: bool = False) -> Iterable[tuple[str, pd.Series]]:
@@ -106,7 +131,7 @@ def _comparisons(found: Analysis) -> str:
             [
                 f"{pair[1]} − {pair[0]}",
                 *(_number(printed["t_published"], 2), _p(printed["p_published"])),
-                f"{row['runs_reference']} + {row['runs_index']}",
+                f"{row['runs_index']} + {row['runs_reference']}",
                 *(_number(row["t_score"], 2), _p(row["p_value"]), _p(row["p_holm"])),
                 f"{_steps(row['difference'])} ({low} to {high})" if low != "–" else "–",
                 *(_p(row["p_permutation"]), _p(row["p_log_rank"])),
@@ -114,6 +139,96 @@ def _comparisons(found: Analysis) -> str:
         )
     heads = ["index − reference", "t, paper", "p, paper", "runs", "t", "p", "p after Holm", "difference (95%)"]
     return _table([*heads, "p, permutations", "p, log-rank"], rows)
+
+
+def _replication(found: Analysis) -> str:
+    rows = []
+    for row in side_by_side(found.table3).to_dict("records"):
+        if pd.notna(row["g_published"]):
+            sides = [_interval(row, f"g_{side}", 2) for side in ("published", "ours")]
+            expected = _range(row, "g_predicted", 2)
+            rows.append([_pair(row), sides[0], expected, sides[1], row["replicates"].replace("-", "–")])
+    heads = ["index − reference", "g, paper (95%)", "to be expected here", "g (95%)", "ours lies"]
+    return _table(heads, rows)
+
+
+def _sensitivity(found: Analysis) -> str:
+    points = found.study.sensitivity
+    limits = [name for name in points.columns if name not in ("index", "reference", "runs", "criterion")]
+    rows = [
+        [_pair(row), row["runs"], row["criterion"], *(row[limit] or "–" for limit in limits)]
+        for row in points.to_dict("records")
+    ]
+    return _table(["index − reference", "runs", "criterion", *limits], rows)
+
+
+def _overview(found: Analysis) -> str:
+    rows = []
+    for row in found.study.overview.to_dict("records"):
+        runs = f"{row['basis']}, {row['runs_index']} + {row['runs_reference']}"
+        ahead = f"{row['faster']} of {row['known']}"
+        rows.append([_pair(row), runs, ahead, *(_steps(row[end]) for end in ("lowest", "asked", "highest"))])
+    return _table(["index − reference", "runs", "index faster at", "lowest", "at 4900, 5 in a row", "highest"], rows)
+
+
+def _paired(found: Analysis) -> str:
+    rows = []
+    for row in found.study.paired.to_dict("records"):
+        counts = [f"{row[name]:.0f}" if pd.notna(row[name]) else "–" for name in ("pairs", "shared_episodes", "faster")]
+        tests = [_p(row[name]) for name in ("p_paired", "p_sign_flip", "p_restricted", "p_value")]
+        rows.append([_pair(row), *counts, _number(row["correlation"], 2), _difference(row, "difference"), *tests])
+    heads = ["index − reference", "seeds", "equal episodes", "index faster on", "correlation", "difference (95%)"]
+    return _table([*heads, "p, paired t", "p, signs", "p, signs, restricted", "p, not paired"], rows)
+
+
+def _blocks(found: Analysis) -> str:
+    rows = [
+        [
+            *(row["cells"], row["seeds"], _number(row["f_score"], 2), _p(row["p_value"])),
+            *(_number(row["friedman"], 2), _p(row["p_permutation"]), _number(row["share_of_seeds"], 2)),
+        ]
+        for row in found.study.blocks.to_dict("records")
+    ]
+    return _table(["cells", "seeds", "F", "p", "Friedman", "p, exact", "share of the seeds"], rows)
+
+
+def _equivalence(found: Analysis) -> str:
+    rows = []
+    for row in found.study.equivalence.to_dict("records"):
+        ends = (_steps(row[end]) for end in ("margin", "least_margin"))
+        alike = row["equivalent"] or "–"
+        rows.append(
+            [_pair(row), *ends, _difference(row, "difference"), _p(row["p_tost"]), _p(row["p_tost_paired"]), alike]
+        )
+    heads = ["index − reference", "margin", "least margin", "difference (90%)", "p", "p, paired"]
+    return _table([*heads, "alike"], rows)
+
+
+def _cost(found: Analysis) -> str:
+    rows = []
+    for row in found.study.cost.to_dict("records"):
+        names = ("own_steps", "teacher_steps", "total_steps", "saved_steps", "students_to_repay")
+        rows.append([row["group"], row["runs"], *(_steps(row[name]) for name in names)])
+    heads = ["cell", "runs", "own steps", "teacher's", "both", "saved against its baseline", "students to repay"]
+    return _table(heads, rows)
+
+
+def _pair(row: dict[Hashable, Any]) -> str:
+    return f"{row['index']} − {row['reference']}"
+
+
+def _difference(row: dict[Hashable, Any], name: str) -> str:
+    low, high = _steps(row["low"]), _steps(row["high"])
+    return f"{_steps(row[name])} ({low} to {high})" if low != "–" else _steps(row[name])
+
+
+def _interval(row: dict[Hashable, Any], name: str, digits: int) -> str:
+    return f"{_number(row[name], digits)} ({_range(row, name, digits)})" if pd.notna(row[name]) else "–"
+
+
+def _range(row: dict[Hashable, Any], name: str, digits: int) -> str:
+    low, high = (_number(row[f"{name}_{end}"], digits) for end in ("low", "high"))
+    return f"{low} to {high}" if low != "–" else "–"
 
 
 def _evaluations(found: Analysis) -> str:
@@ -189,8 +304,9 @@ def _p(value: float) -> str:
 
 
 def main() -> None:
-    """Fills the page."""
+    """Fills the page and draws its figures."""
     PAGE.write_text(filled(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    draw()
     print(f"written: {PAGE.relative_to(ROOT)}")
 
 
