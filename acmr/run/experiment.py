@@ -144,10 +144,12 @@ class Session:
             files = {run_dir.config_file.name: self._settings, **state.logs.digests()}
             summary = run_dir.finish(summary, files)
         except BaseException:
-            # What ended the run matters more than what closing may raise.
+            # What ended the run matters more than what closing may raise; a tracker may take a while for it.
+            self.stop.release()
             with suppress(Exception):
                 close_all(trainer.observers, None)
             raise
+        self.stop.release()
         close_all(trainer.observers, summary)
         if summary["physics_warnings"]:
             counts = ", ".join(f"{count:,} x {kind}" for kind, count in summary["physics_warnings"].items())

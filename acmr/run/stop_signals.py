@@ -46,7 +46,12 @@ class StopSignals(AbstractContextManager["StopSignals"]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for number, handler in self._before.items():
+        self.release()
+
+    def release(self) -> None:
+        """Lets signals do what they did before: there is no step any more whose end would heed them."""
+        before, self._before = self._before, {}
+        for number, handler in before.items():
             signal.signal(number, handler)
 
     @property

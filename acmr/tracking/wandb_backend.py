@@ -11,6 +11,7 @@ import logging
 import os
 import re
 import shutil
+import signal
 import sys
 import threading
 import urllib.error
@@ -37,6 +38,10 @@ _KEPT_VARIABLES = frozenset(
 )
 #: How W&B begins the name of a run's folder.
 _TIMED = re.compile(r"(offline-)?run-(\d{8}_\d{6})-")
+#: Seconds that a process which was killed may take to vanish.
+_END_WAIT = 2.0
+#: W&B's connection to the service process of this one.
+_connections: list[Any] = []
 _NOT_IN_ID = re.compile(r"[^A-Za-z0-9_.,=+-]+")
 
 
@@ -186,6 +191,9 @@ def _start(arguments: Mapping[str, Any], folder: Path, server: str | None) -> Ru
         if server:
             settings.base_url = server
         run = wandb.init(dir=str(folder.parent), settings=settings, **arguments)
+        # Kept here, for W&B itself forgets it as it begins to wait for its end.
+        with contextlib.suppress(AttributeError):
+            _connections[:] = [wandb.sdk.wandb_setup.singleton()._connection]
     run.define_metric("global_step", hidden=True)
     run.define_metric("*", step_metric="global_step")
     return run
@@ -198,6 +206,20 @@ def end_service(exit_code: int) -> None:
         # A service that died raises here, one that failed exits; each forgets the user's WANDB_SERVICE.
         with wandb_variables({}), contextlib.suppress(Exception, SystemExit):
             wandb.teardown(exit_code)
+
+
+def kill_service() -> None:
+    """Ends a service process that does not answer, by its number; at the program's end W&B waits for nothing then."""
+    wandb = sys.modules.get("wandb")
+    if wandb is None:
+        return
+    # Of all this W&B tells nobody; tests/test_tracking_hang.py finds out if it changes.
+    with contextlib.suppress(Exception):
+        connection = _connections.pop() if _connections else wandb.sdk.wandb_setup.singleton()._connection
+        process = connection._proc._process
+        os.kill(process.pid, signal.SIGKILL)
+        connection._cleanup()
+        process.wait(_END_WAIT)
 
 
 @contextlib.contextmanager

@@ -19,7 +19,8 @@ from acmr.records import EpisodeRecord, portable_settings
 from acmr.settings.run_spec import RunSpec
 from acmr.text import one_line
 from acmr.tracking import wandb_backend
-from acmr.tracking.observer import Say, Tracker
+from acmr.tracking.observer import Observer, Say, Tracker
+from acmr.tracking.threaded import Threaded
 from acmr.tracking.wandb_backend import LONGEST
 
 if TYPE_CHECKING:
@@ -27,12 +28,16 @@ if TYPE_CHECKING:
 
 #: How often it is checked that rows reach the file, and how old a row may grow before it counts as lost, in seconds.
 ARRIVAL_CHECK = 15.0
+#: Seconds that W&B may take over a row, and to take the rest at the end, before its service is ended.
+PATIENCE, CLOSE_WAIT = 30.0, 45.0
 #: Tag of runs that end at their threshold.
 STOPPED = "stopped"
 
 
-class WandbTracker(Tracker):
+class WandbTracker(Tracker, Threaded):
     """Mirrors a run to W&B; an earlier mirror of the same run in the same folder is replaced.
+
+    All of W&B is in a thread of its own, for it waits for its service process without any limit.
 
     Args:
         spec: The run.
@@ -43,6 +48,13 @@ class WandbTracker(Tracker):
     """
 
     title = "W&B mirror"
+
+    def __init__(self, spec: RunSpec, say: Say) -> None:
+        Threaded.__init__(self, lambda: _Mirror(spec, say), wandb_backend.kill_service, PATIENCE, CLOSE_WAIT)
+
+
+class _Mirror(Observer):
+    """The same, in whatever thread it is used."""
 
     def __init__(self, spec: RunSpec, say: Say) -> None:
         self._run = _start(spec, say)
