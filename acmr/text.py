@@ -6,6 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from itertools import takewhile
 
+from acmr.names import terminal
+
 #: Characters of an error's message that are shown; a server's answer or a list of names can fill pages.
 LONGEST_MESSAGE = 400
 #: Columns of a pipe or a file, where nothing has to fit.
@@ -17,8 +19,8 @@ _PARTS, _SEPARATORS = re.compile(r"(?=-[A-Za-z]|  |/)"), "- /"
 
 
 def message(error: BaseException) -> str:
-    """The message of an error on one line, or its type where it has none: ``no such file``."""
-    return without_userinfo(" ".join(str(error).split()))[:LONGEST_MESSAGE] or type(error).__name__
+    """The message of an error on one line of visible letters, or its type where it has none: ``no such file``."""
+    return without_userinfo(terminal(" ".join(str(error).split())))[:LONGEST_MESSAGE] or type(error).__name__
 
 
 def holds_userinfo(value: object) -> bool:

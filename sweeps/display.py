@@ -81,7 +81,7 @@ class Display:
 
     def say(self, text: str) -> None:
         """Prints a line, above the table if there is one."""
-        self._console.print(text, markup=False, soft_wrap=True)
+        self._console.print(terminal(text), markup=False, soft_wrap=True)
         sys.stdout.flush()
 
     def close(self) -> None:

@@ -11,6 +11,7 @@ from acmr.config import ConfigError, EnvConfig
 from acmr.envs import describe
 from acmr.envs.construct import find_spec, gym_ids
 from acmr.envs.wrappers import near_matches
+from acmr.names import terminal
 from acmr.settings.compose import environment_config, options
 from acmr.settings.errors import USER_ERRORS, explain
 
@@ -58,7 +59,7 @@ def main() -> int:
     name = parser.parse_args().name
     try:
         for line in overview() if name is None else details(name):
-            print(line)
+            print(terminal(line))
     except USER_ERRORS as error:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2

@@ -19,6 +19,7 @@ from acmr.config import IMPUTATIONS, MEAN, ConfigError
 from acmr.evaluation.camera import without_gl
 from acmr.evaluation.evaluate import evaluate, still
 from acmr.evaluation.video import FILM_SUFFIXES
+from acmr.names import terminal
 from acmr.records import EVALUATION_FILE, MOST_SEED
 
 #: Of one side of a picture, and of a film.
@@ -34,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             importlib.import_module("acmr.envs")
         given.action(given)
     except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(terminal(f"error: {error}"), file=sys.stderr)
         return 2
     return 0
 

@@ -18,6 +18,7 @@ from acmr.config import ConfigError, EnvConfig
 from acmr.evaluation.camera import is_robot, make_camera
 from acmr.evaluation.rollout import MOST_STEPS, Episode, VideoOptions, play, render_mode
 from acmr.evaluation.zero_shot import policy_in
+from acmr.names import terminal
 from acmr.records import CONFIG_FILE, EVALUATION_FILE, portable
 from acmr.settings.compose import environment_config
 from acmr.settings.stored import stored_environment
@@ -119,7 +120,7 @@ def evaluate(given: argparse.Namespace) -> None:
         print(f"{'body':<{width}}  {'mean':>10}  {'least':>10}  {'most':>10}  {'length':>7}")
         for content in contents:
             numbers = [f"{content[f'{key}_return']:>10,.1f}" for key in ("mean", "min", "max")]
-            print(f"{content['environment']:<{width}}  {'  '.join(numbers)}  {content['mean_length']:>7,.0f}")
+            print(terminal(f"{content['environment']:<{width}}  {'  '.join(numbers)}  {content['mean_length']:>7,.0f}"))
 
 
 def _policy(
@@ -129,10 +130,10 @@ def _policy(
     if is_own:
         remark = check_fit(teacher, config)
         if remark:
-            print(f"warning: {remark}", file=sys.stderr)
+            print(terminal(f"warning: {remark}"), file=sys.stderr)
         return remark, teacher.build_networks().actor.eval()
     actor, lines = policy_in(teacher, config, given.impute, given.trust)
-    print(f"{config.name}: {'; '.join(lines)}")
+    print(terminal(f"{config.name}: {'; '.join(lines)}"))
     return None, actor
 
 
@@ -147,7 +148,8 @@ def _evaluate_in(
     """Plays, prints each episode, and returns the content of the file."""
     if limit(config) is None:
         print(
-            f"warning: {config.name} has no time limit: an episode is cut off at {MOST_STEPS:,} steps", file=sys.stderr
+            terminal(f"warning: {config.name} has no time limit: an episode is cut off at {MOST_STEPS:,} steps"),
+            file=sys.stderr,
         )
     episodes = []
     video = VideoOptions(given.video, given.seconds, given.width, given.height) if given.video else None
@@ -188,7 +190,7 @@ def _store(content: dict[str, Any], path: Path) -> None:
         raise ConfigError(f"{error}; type --out FILE.json") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror}); type --out FILE.json") from error
-    print(f"written: {path}")
+    print(terminal(f"written: {path}"))
 
 
 def _velocity(value: float | None) -> str:

@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from acmr.config import ConfigError, ExperimentConfig, flatten
+from acmr.names import terminal
 from acmr.settings.compose import groups, launchers, options, setting_keys, sources, unknown_key
 from acmr.settings.files import place_of_key, place_of_text
 from acmr.text import message, without_userinfo
@@ -32,7 +33,7 @@ def explain(error: BaseException) -> str:
     Args:
         error: One of :data:`USER_ERRORS`.
     """
-    return without_userinfo(_explained(error))
+    return without_userinfo(terminal(_explained(error)))
 
 
 def _explained(error: BaseException) -> str:

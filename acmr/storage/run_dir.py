@@ -15,6 +15,7 @@ import yaml
 
 from acmr.config import ConfigError, ExperimentConfig, differing_keys
 from acmr.foreign import SETTINGS, is_there, read_mapping
+from acmr.names import terminal
 from acmr.records import (
     COMPLETE,
     CONFIG_FILE,
@@ -172,6 +173,7 @@ class RunDir:
                 os.write(descriptor, f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n".encode(errors="replace"))
 
         def both(line: str) -> None:
+            line = terminal(line)
             note(line)
             with suppress(OSError, ValueError):
                 say(line)

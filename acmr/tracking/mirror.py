@@ -17,6 +17,7 @@ from typing import Any
 from acmr.command import command
 from acmr.config import ConfigError
 from acmr.foreign import is_there, read_mapping
+from acmr.names import terminal
 from acmr.records import CONFIG_FILE, SUMMARY_FILE, DamagedError
 from acmr.settings.compose import compose_config, options, parse
 from acmr.settings.run_spec import RunSpec
@@ -146,7 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         problems.append(str(error))
     for problem in problems:
-        print(f"error: {problem}", file=sys.stderr)
+        print(terminal(f"error: {problem}"), file=sys.stderr)
     return 2 if problems else 0
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from acmr.command import command
 from acmr.config import ConfigError
+from acmr.names import terminal
 from acmr.transfer.teacher import load_teacher, save_halved
 
 
@@ -24,7 +25,7 @@ def main() -> int:
     try:
         save_halved(given.out, load_teacher(given.run_dir))
     except (ConfigError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(terminal(f"error: {error}"), file=sys.stderr)
         return 2
     return 0
 

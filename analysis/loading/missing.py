@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from shlex import quote
 
 import pandas as pd
 
@@ -42,7 +43,7 @@ def missing_runs(data: RunSet) -> list[Missing]:
     """Every planned cell and seed without a run that counts, in the order of the cells."""
     runs = data.runs
     profile = profile_of(data)
-    option = "" if profile == "paper" else f" profile={profile}"
+    option = "" if profile == "paper" else f" {quote(f'profile={profile}')}"
     found = []
     for cell, teaches in ((cell.name, cell.teaches) for cell in data.cells):
         own = runs[runs["cell"] == cell]
@@ -73,11 +74,11 @@ def command_for(runs: pd.DataFrame, seeds: Iterable[int], profile: str) -> str:
     cell = runs["cell"].iloc[0]
     if pd.isna(cell):
         return ""
-    return f"python run.py matrix={profile} experiment={cell} seed={_list(seeds)}{stop_words(runs)}"
+    return f"python run.py {quote(f'matrix={profile}')} experiment={cell} seed={_list(seeds)}{stop_words(runs)}"
 
 
 def profile_of(data: RunSet) -> str:
-    """The profile that the runs say, else the folder's name as in ``runs/quick``, else the paper's."""
+    """The profile that the runs say (any text), else the folder's name as in ``runs/quick``, else the paper's."""
     said = data.runs["profile"].dropna()
     if len(said):
         return str(said.iloc[0])
@@ -87,7 +88,7 @@ def profile_of(data: RunSet) -> str:
 
 def matrix_command(data: RunSet) -> str:
     """The one command that makes all that is missing and leaves alone what is complete."""
-    words, seeds = [f"python run.py matrix={profile_of(data)}"], planned_seeds(data.runs)
+    words, seeds = [f"python run.py {quote(f'matrix={profile_of(data)}')}"], planned_seeds(data.runs)
     stop, missing = stop_words(data.runs[data.runs["cell"].notna()]), missing_runs(data)
     if stop and missing:
         # Only what is missing is named: what is complete may have been made with another stop_after.

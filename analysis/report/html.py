@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -100,7 +101,12 @@ def write_report(report: Report, folder: Path, out: Path) -> Path:
     environment.filters["footnote"] = footnote
     numbers = report.analysis
     defining, differing = setting_differences(numbers.data)
+    style, script = (_source(environment, name) for name in ("report.css", "report.js"))
     page = environment.get_template("report.html").render(
+        style=style,
+        script=script,
+        # Only what stands here word for word is run or applied: nothing that a name brings along.
+        allowed={"style": _hash(style), "script": _hash(script)},
         report=report,
         analysis=numbers,
         profile=profile_of(numbers.data),
@@ -120,6 +126,17 @@ def write_report(report: Report, folder: Path, out: Path) -> Path:
     path = folder / "report.html"
     path.write_text(page, encoding="utf-8")
     return path
+
+
+def _source(environment: jinja2.Environment, name: str) -> Markup:
+    """A file of ours that becomes a part of the page as it is."""
+    assert environment.loader is not None
+    return Markup(environment.loader.get_source(environment, name)[0])
+
+
+def _hash(text: str) -> str:
+    """What a content security policy calls the text of an element."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}"
 
 
 def _shown(value: object) -> object:
@@ -180,4 +197,5 @@ def _known(value: float) -> float | None:
 
 
 def _relative(path: Path, out: Path) -> str:
-    return link(Path(os.path.relpath(path.resolve(), out.resolve())))
+    # Else a folder that is called "javascript:..." or "https:..." would be another kind of address.
+    return f"./{link(Path(os.path.relpath(path.resolve(), out.resolve())))}"
