@@ -65,11 +65,19 @@ def write_three(root: Path) -> None:
     write_matrix(root, {"A0": (8000, 8500, 8100), "A2": (6000, None, 7000)}, total=TOTAL, length=100)
 
 
-@pytest.fixture(scope="module", params=[write_hard, write_few, write_three], ids=["hard", "few", "three"])
-def data(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> FigureData:
-    root = tmp_path_factory.mktemp("runs")
-    request.param(root)
-    return drawing(root)
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FigureData]:
+    found = {}
+    for name, write in (("hard", write_hard), ("few", write_few), ("three", write_three)):
+        root = tmp_path_factory.mktemp(name)
+        write(root)
+        found[name] = drawing(root)
+    return found
+
+
+@pytest.fixture(params=["hard", "few", "three"])
+def data(request: pytest.FixtureRequest, folders: dict[str, FigureData]) -> FigureData:
+    return folders[request.param]
 
 
 def drawing(root: Path) -> FigureData:
@@ -131,9 +139,8 @@ def test_a_cell_has_one_color_in_all_figures(data: FigureData, name: str):
         plt.close(figure)
 
 
-def test_captions_name_what_is_drawn(tmp_path):
-    write_hard(tmp_path / "hard")
-    hard = drawing(tmp_path / "hard")
+def test_captions_name_what_is_drawn(folders):
+    hard, few = folders["hard"], folders["few"]
     assert SPECS["figure_4"].said(hard).endswith("Drawn: A0 (12 runs), H0 (3 runs).")
     assert SPECS["figure_6"].said(hard).endswith("Drawn: H0 (3 runs), H1 (1 run).")
     said = SPECS["figure_5"].said(hard)
@@ -143,8 +150,6 @@ def test_captions_name_what_is_drawn(tmp_path):
     assert "A2 − A0, 3 and 12 runs, " in SPECS["differences"].said(hard)
     assert LONG in SPECS["learning_curves"].said(hard)
     assert "A2 − A0" in SPECS["sensitivity"].said(hard)
-    write_few(tmp_path / "few")
-    few = drawing(tmp_path / "few")
     assert SPECS["figure_5"].said(few).endswith("Drawn: A0 (2 runs), A2 (1 run).")
     assert SPECS["return_profiles"].said(few).endswith("Drawn: H0 (1 full run), A0 (2 full runs), A2 (1 full run).")
 

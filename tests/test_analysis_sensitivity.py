@@ -166,12 +166,10 @@ def test_a_cell_of_which_the_fast_runs_have_ended_has_no_difference(tmp_path):
         write_cut(tmp_path, "A0", seed, rows_reaching(steps, TOTAL), TOTAL)
     write_cut(tmp_path, "A2", 1, rows_reaching(5000, TOTAL), TOTAL)
     write_under_way(tmp_path, "A2", 2, 4000, TOTAL)
-    points = points_of(tmp_path)
-    own = points[points["index"] == "A2"]
+    study = analyze(load(tmp_path)).study
+    own = study.points[study.points["index"] == "A2"]
     assert own.loc[own["threshold"] <= 4900, "difference"].isna().all()
-    assert "A2 − A0, all runs (1 + 3): not known at any of 56 settings" in sensitivity_lines(
-        analyze(load(tmp_path)).study.overview
-    )
+    assert "A2 − A0, all runs (1 + 3): not known at any of 56 settings" in sensitivity_lines(study.overview)
 
 
 def test_a_run_that_never_got_there_gives_restricted_means(tmp_path):

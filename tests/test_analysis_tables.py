@@ -15,7 +15,7 @@ from acmr.cells import CELLS
 from analysis.analyze import Analysis, analyze
 from analysis.loading.load import InputError, load
 from analysis.report.published import published_table3, side_by_side
-from analysis.report.tables import paper_columns, write_table
+from analysis.report.tables import _latex_cell, paper_columns, write_table
 from analysis.statistics.summaries import scores, steps_table, table1, table2, transfer_table
 
 #: (reference, index) of the paper's table 3.
@@ -229,6 +229,10 @@ def test_table_files(tmp_path):
     # The heading one word a line, negative numbers with a minus sign.
     assert r" & \shortstack[r]{n\\reference} & " in latex
     assert "$-$" in latex
+    # Also behind a bracket, and where the sign is the typographic one, which LaTeX alone does not know.
+    assert [_latex_cell(text) for text in ("-5", "(−12,000)", "−3", "A2 − A0")] == [
+        *("$-$5", "($-$12,000)", "$-$3", "A2 − A0"),
+    ]
     assert " -" not in latex
     write_table(table1(), tmp_path, "table1", "A & B")
     narrow = (tmp_path / "table1.tex").read_text()

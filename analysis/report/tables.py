@@ -85,7 +85,7 @@ def _latex(shown: pd.DataFrame, alignment: list[str], name: str, caption: str) -
 
 
 def _latex_cell(text: object) -> str:
-    return re.sub(r"^-(?=\d)", "$-$", latex(str(text)))
+    return re.sub(r"^(\(?)[-−](?=\d)", r"\1$-$", latex(str(text)))
 
 
 def _csv_value(value: object) -> object:
