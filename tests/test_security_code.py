@@ -249,3 +249,10 @@ def test_a_teachers_hash_is_no_path(sha256, tmp_path):
     config = parse(compose_config(["transfer=hidden", "env=ant_three_legs", f"transfer.teacher={run}"]))
     assert "/" not in specify(config).name
     assert ".." not in specify(config).name
+
+
+@pytest.mark.parametrize("threshold", [10**400, -(10**400), "x", [1], {"a": 1}, None])
+def test_a_number_that_is_none_costs_a_line(threshold):
+    with pytest.raises(ConfigError) as caught:
+        stored_config({"threshold": threshold})
+    assert "\n" not in str(caught.value)

@@ -111,7 +111,7 @@ def _typed(schema: type[Any], settings: Mapping[Any, Any]) -> Any:
         raise ConfigError(str(error).strip().splitlines()[0]) from error
     except ConfigError:
         raise
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
         raise ConfigError("no settings of this project") from error
 
 
