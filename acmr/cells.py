@@ -64,7 +64,7 @@ class Cell:
         return self.role == SOURCE and self.transfer == TransferConfig().name and not self.changes
 
 
-#: Every cell by its name, in the order of tables: first the paper's (paper, table 2).
+#: Every cell by its name, in the order of tables: first the paper's (paper, table 2), then those that go beyond it.
 CELLS = {
     cell.name: cell
     for cell in (
@@ -75,6 +75,7 @@ CELLS = {
         Cell("A2", TARGET, "hidden", True, "Conf. 2", "A0", "transfer", "green", "^", published=True),
         Cell("A3", TARGET, "expand", False, "Conf. 3", "A0", "transfer", "red", "D", published=True),
         Cell("A4", TARGET, "expand", True, "Conf. 4", "A0", "transfer", "purple", "v", published=True),
+        Cell("N1", TARGET, "named", False, "By name", "A0", "named", "pink", "*"),
     )
 }
 

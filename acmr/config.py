@@ -20,6 +20,9 @@ NEUTRAL_KEYS = (
 #: Settings that a teacher must share with its student: its length and the shape of its networks.
 TEACHER_KEYS = ("total_timesteps", "agent.hidden_sizes")
 
+#: Choose the teacher, of which ``transfer.json`` has the hash.
+TEACHER_CHOICE = ("transfer.teacher", "transfer.teacher_seeds")
+
 #: When a run ends: after all its steps, or as soon as it has met its threshold.
 HORIZON, THRESHOLD = "horizon", "threshold"
 #: Settings that can only cut a run short: what it does until then stays the same, and so does the paper's cell.
@@ -109,8 +112,7 @@ class SACConfig:
     alpha: float = 0.2
     #: Of matrix products: float32 or bfloat16. Weights and optimizers are in float32 either way.
     precision: str = PRECISIONS[0]
-    #: Updates over which each learning rate rises from zero; 0: it is there at once. This setting and the next three
-    #: are for students that have something to lose (acmr/agent/fine_tuning.py).
+    #: Updates over which learning rates rise from zero. This and the next three: acmr/agent/fine_tuning.py.
     warmup: int = 0
     #: Updates that the critics make before the actor's first.
     critics_first: int = 0
@@ -161,16 +163,16 @@ class TransferConfig:
     rules: TransferRules = field(default_factory=TransferRules)
     #: Path of a teacher file or of a finished run; None: the run of the source environment with the same seed.
     teacher: str | None = None
+    #: Teachers that students take in turn, unless a path names one: seed s that of seed (s - 1) mod so many + 1.
+    teacher_seeds: int | None = None
     #: Activation between the new input adapter and the teacher's first layer (``expand`` only).
     adapter_activation: str = "relu"
     #: Start from the teacher's temperature instead of log_alpha = 0.
     copy_log_alpha: bool = False
-    #: Sensors and actuators that the student calls otherwise than the teacher, each as ``old:new`` (``named`` only);
-    #: on the command line ``transfer.rename={old: new}``.
+    #: What the student calls otherwise, as ``old:new``; typed ``transfer.rename={old: new}`` (``named`` only).
     rename: list[str] = field(default_factory=list)
-    #: What those count as that the student has not (``named`` only): ``mean`` under the teacher's policy, a share of
-    #: it such as ``0.75``, ``zero``, or ``initial``, their mean at the start of an episode. ``auto`` tries some of
-    #: these in the first episodes, and keeps the best.
+    #: What those count as that the student has not (``named`` only): their ``mean``, a share of it such as ``0.75``,
+    #: ``zero``, or their ``initial`` mean; ``auto`` tries some of these in the first episodes, and keeps the best.
     impute: str = AUTO
     #: Free room for the settings of methods that are added.
     options: dict[str, Any] = field(default_factory=dict)
@@ -293,6 +295,6 @@ def differing_keys(stored: Mapping[str, Any], config: ExperimentConfig) -> list[
     return [
         key
         for key in keys
-        # One teacher may be named by several paths; the run's name identifies it by its content.
-        if not is_neutral(key) and key != "transfer.teacher" and before.get(key) != now.get(key)
+        # One teacher may be reached in several ways; the run's name identifies it by its content.
+        if not is_neutral(key) and key not in TEACHER_CHOICE and before.get(key) != now.get(key)
     ]

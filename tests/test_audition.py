@@ -43,6 +43,16 @@ def test_luck_in_one_episode_is_found_out() -> None:
     assert chosen == "b"
 
 
+def test_one_that_does_well_enough_plays_on_before_the_others_are_tried() -> None:
+    returns = {"a": [4.0], "b": [5.0, 6.0, 1.0], "c": [3.0], "d": [5.0, 5.0, 9.0, 7.0, 5.0]}
+    audition, order = Audition({name: {} for name in returns}).until(5.0), []
+    while not audition.is_over:
+        order.append(audition.best)
+        audition.add(returns[order[-1]].pop(0))
+    assert "".join(order) == "abbbcddddd"
+    assert audition.best == "d"
+
+
 def test_of_equals_the_first_is_chosen_and_a_single_one_need_not_play() -> None:
     assert play({"a": [3.0] * 5, "b": [3.0] * 5})[:2] == (["a", "b", "a", "a", "a", "a"], "a")
     assert Audition({}).is_over

@@ -12,7 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acmr.cells import CELLS
-from acmr.config import NEUTRAL_KEYS, SACConfig, differing_keys, flatten, plain_settings, schema_defaults
+from acmr.config import (
+    NEUTRAL_KEYS,
+    TEACHER_CHOICE,
+    SACConfig,
+    differing_keys,
+    flatten,
+    plain_settings,
+    schema_defaults,
+)
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.errors import USER_ERRORS, check_booleans, explain
 from acmr.settings.run_spec import specify, teacher_spec
@@ -232,13 +240,28 @@ def test_a_setting_that_a_stored_run_lacks_had_its_default(overrides):
     stored = plain_settings(config)
     assert differing_keys(stored, config) == []
     for key, value in flatten(stored).items():
-        neutral = key.split(".")[0] in NEUTRAL_KEYS or key == "transfer.teacher"
+        neutral = key.split(".")[0] in NEUTRAL_KEYS or key in TEACHER_CHOICE
         same = neutral or (key in defaults and value == defaults[key])
         assert differing_keys(without(stored, key), config) == ([] if same else [key])
     for group in ("agent", "transfer"):
         assert set(differing_keys({key: stored[key] for key in stored if key != group}, config)) <= {
             key for key in flatten(stored) if key.startswith(group)
         }
+
+
+@pytest.mark.parametrize(("seed", "turns", "teacher"), [(1, 3, 1), (3, 3, 3), (4, 3, 1), (101, 3, 2), (7, None, 7)])
+def test_students_take_teachers_in_turn(seed, turns, teacher):
+    words = [f"seed={seed}", *([f"transfer.teacher_seeds={turns}"] if turns else [])]
+    student = spec("experiment=N1", *words)
+    assert teacher_spec(student.config).config.seed == teacher
+    # Whose turn it is says the teacher's hash in transfer.json, not the name.
+    assert (student.cell, student.name) == ("N1", "armless_humanoid-named")
+    assert ("transfer.teacher_seeds=3" in student.command) == (turns == 3)
+
+
+def test_no_turn_is_none():
+    with pytest.raises(ConfigError, match=r"transfer\.teacher_seeds=0: an integer of at least 1"):
+        spec("experiment=N1", "transfer.teacher_seeds=0")
 
 
 def test_a_setting_that_only_a_stored_run_knows_is_a_difference_if_it_was_set():

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from acmr.config import INEXACT, ConfigError, flatten, is_neutral, schema_defaults
+from acmr.config import INEXACT, TEACHER_CHOICE, ConfigError, flatten, is_neutral, schema_defaults
 from acmr.envs.state import ANYTIME, NEVER
 from acmr.records import DamagedError
 from acmr.run.preparation import Prepared
@@ -191,7 +191,7 @@ def _key(prepared: Prepared) -> CheckpointKey:
     settings = {
         key: value
         for key, value in flatten(spec.settings).items()
-        if not is_neutral(key) and key != "transfer.teacher" and (key not in usual or value != usual[key])
+        if not is_neutral(key) and key not in TEACHER_CHOICE and (key not in usual or value != usual[key])
     }
     # One teacher may be reached by several paths; its hash says which it is.
     teacher = {**(report["teacher"] or {}), "path": None}

@@ -220,7 +220,7 @@ def make_trainer(prepared: Prepared, env: gym.Env[np.ndarray, np.ndarray], logs:
         total_timesteps=config.most_steps,
         log_every=config.log_every,
         episode=EpisodeInProgress(about.reward_terms, about.has_forward_velocity),
-        audition=prepared.audition,
+        audition=prepared.audition.until(config.threshold),
         is_satisfied=lambda: config.stop == THRESHOLD and logs.meet(config.threshold, config.consecutive),
     )
 

@@ -11,6 +11,7 @@ from typing import Any
 from acmr.cells import SOURCE, TARGET, cell_of, digest, run_name
 from acmr.config import (
     HORIZON,
+    TEACHER_CHOICE,
     TEACHER_KEYS,
     ConfigError,
     ExperimentConfig,
@@ -24,7 +25,7 @@ from acmr.records import DESCRIPTION_FILE, DamagedError
 from acmr.settings.compose import as_override, baseline, compose_config, env_overrides, parse, sources
 
 #: Settings that a run's name spells out in its own way.
-_NAMED_KEYS = ("seed", "freeze", "agent.name", "transfer.name", "transfer.teacher", "env.name")
+_NAMED_KEYS = ("seed", "freeze", "agent.name", "transfer.name", *TEACHER_CHOICE, "env.name")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 #: What stands in a method's file only.
 _RULES = "transfer.rules."
@@ -76,12 +77,14 @@ def specify(config: ExperimentConfig) -> RunSpec:
 
 
 def teacher_spec(config: ExperimentConfig) -> RunSpec:
-    """The run that teaches a student: its source environment, profile, seed, length and network sizes.
+    """The run that teaches a student: its source environment, profile, length, network sizes, and seed or its turn.
 
     It takes all its steps even where its student stops, or its profile lets runs stop, at the threshold: what a student
     learns from must not depend on when its teacher happened to be good.
     """
-    overrides = [*env_overrides(config.env.source), f"profile={config.profile}", f"seed={config.seed}"]
+    turns = config.transfer.teacher_seeds
+    seed = config.seed if turns is None else (config.seed - 1) % turns + 1
+    overrides = [*env_overrides(config.env.source), f"profile={config.profile}", f"seed={seed}"]
     flat = flatten(asdict(config))
     overrides += [f"{key}={as_override(flat[key])}" for key in TEACHER_KEYS]
     overrides += [f"stop={HORIZON}", "stop_after=null", f"output_dir={as_override(config.output_dir)}"]
@@ -123,6 +126,8 @@ def _short_overrides(spec: RunSpec) -> list[str]:
     said += [f"{key}={as_override(value)}" for key, value in spec.changes.items()]
     if config.transfer.teacher is not None:
         said.append(f"transfer.teacher={as_override(config.transfer.teacher)}")
+    if config.transfer.teacher_seeds is not None:
+        said.append(f"transfer.teacher_seeds={config.transfer.teacher_seeds}")
     said.append(f"seed={config.seed}")
     if config.output_dir != default.output_dir:
         said.append(f"output_dir={as_override(config.output_dir)}")

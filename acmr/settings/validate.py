@@ -55,6 +55,8 @@ def validate(config: ExperimentConfig) -> None:
         _at_least(f"agent.{key}", getattr(agent, key), 0)
     _at_least("agent.kickstart_updates", agent.kickstart_updates, 1)
     _within("agent.kickstart", agent.kickstart, low=0.0, high=math.inf)
+    if config.transfer.teacher_seeds is not None:
+        _at_least("transfer.teacher_seeds", config.transfer.teacher_seeds, 1)
     if config.checkpoint_every is not None:
         _at_least("checkpoint_every", config.checkpoint_every, 0)
     check_environment(config.env)

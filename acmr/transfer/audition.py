@@ -6,6 +6,7 @@ episodes of a run try some: they are steps of the run like any others, counted, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from statistics import fmean
 
@@ -22,18 +23,23 @@ EPISODES = 5
 class Audition:
     """Lets ways to begin play in turn: each once, then whichever has the best mean return so far.
 
-    The first to have played all of :data:`EPISODES` is chosen. A bad one is hardly seen again, and one that stands
-    plays without a break, so that it may meet the run's threshold before anything is learned.
+    The first to have played all of :data:`EPISODES` is chosen. A bad one is hardly seen again, and one that does well
+    enough plays without a break, so that the run may meet its threshold before anything is learned.
 
     Args:
         choices: The ways to begin by their names; with fewer than two there is nothing to choose.
+        enough: Who has never returned less plays on before the others are tried.
     """
 
-    def __init__(self, choices: Mapping[str, Biases]) -> None:
-        self._choices = choices
+    def __init__(self, choices: Mapping[str, Biases], enough: float = math.inf) -> None:
+        self._choices, self._enough = choices, enough
         self.returns: dict[str, list[float]] = {name: [] for name in choices}
         # Told once what was chosen; whoever makes a run may set it.
         self.on_chosen: Callable[[str], None] = lambda line: None
+
+    def until(self, enough: float) -> Audition:
+        """The same audition for a run whose threshold is this return; nobody has played in it yet."""
+        return Audition(self._choices, enough)
 
     @property
     def is_over(self) -> bool:
@@ -42,11 +48,14 @@ class Audition:
 
     @property
     def best(self) -> str:
-        """Who plays next, or who was chosen: the first that has not played yet, else the best mean return."""
-        # Of equal means the first.
-        return next((name for name, played in self.returns.items() if not played), None) or max(
-            self.returns, key=lambda name: (len(self.returns[name]) >= EPISODES, fmean(self.returns[name]))
-        )
+        """Who plays next, or who was chosen."""
+        return max(self.returns, key=self._rank)
+
+    def _rank(self, name: str) -> tuple[bool, bool, bool, float]:
+        played = self.returns[name]
+        # Of equals the first: max keeps it.
+        satisfies = bool(played) and min(played) >= self._enough
+        return len(played) >= EPISODES, satisfies, not played, fmean(played) if played else 0.0
 
     def biases(self) -> Biases:
         """What the one that plays next sets."""
