@@ -15,6 +15,7 @@ from acmr.cells import CELLS
 from acmr.config import (
     NEUTRAL_KEYS,
     TEACHER_CHOICE,
+    ConfigError,
     SACConfig,
     differing_keys,
     flatten,
