@@ -147,7 +147,15 @@ def test_a_run_that_only_says_it_is_the_cell_is_not(mine, tmp_path):
     assert only(tmp_path)["group"] == "armless_humanoid-hidden-frozen-q_lr=0.5"
 
 
-@pytest.mark.parametrize("odd", [{"pair": {"source": ["a"], "target": 3}}, {"env": []}, {"transfer": {"name": {}}}])
+def test_settings_that_are_cut_off_leave_it_to_the_directory_s_name(tmp_path):
+    folder = write_run(tmp_path, "A2", 1, rows_reaching(6000, TOTAL), total=TOTAL, summary={"cell": ["A2"]})
+    stored = yaml.safe_load((folder / "config.yaml").read_text())
+    (folder / "config.yaml").write_text(yaml.safe_dump(stored | {"env": []}))
+    assert only(tmp_path)["cell"] == "A2"
+    assert "config.yaml is cut off, it has no env" in only(tmp_path)["doubts"]
+
+
+@pytest.mark.parametrize("odd", [{"pair": {"source": ["a"], "target": 3}}, {"transfer": {"name": {}}}])
 def test_settings_of_any_shape_are_no_cell(odd, tmp_path):
     folder = write_run(tmp_path, "A2", 1, rows_reaching(6000, TOTAL), total=TOTAL, summary={"cell": ["A2"]})
     stored = yaml.safe_load((folder / "config.yaml").read_text())

@@ -74,7 +74,7 @@ def test_it_is_drawn_and_reported(done):
     folder, _, _ = done
     out = folder / "results" / "quick"
     page = (out / "report.html").read_text()
-    assert "A0 to A4, A5." in page
+    assert "A5 (3 runs)." in page
     assert "A1, A2, A3, A4, A5 answer one question five times" in page
     assert page.count('title="ant_three_legs-hidden-frozen-q_lr=0.0005/seed_') == 3
     assert "experiment=H0,H1,A0,A1,A2,A3,A4,A5" in page
