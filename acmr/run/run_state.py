@@ -157,9 +157,16 @@ def check_space(config: ExperimentConfig, networks: Networks, run_dir: Path, che
     Raises:
         ConfigError: With what it needs and what there is.
     """
-    place = next((folder for folder in (run_dir, *run_dir.absolute().parents) if folder.is_dir()), Path("/"))
+    try:
+        place = next((folder for folder in (run_dir, *run_dir.absolute().parents) if folder.is_dir()), Path("/"))
+    except OSError as error:
+        raise ConfigError(f"{run_dir}: cannot be made ({error.strerror}); type another output_dir=FOLDER") from error
     needed = space_needed(config, networks)
-    free = shutil.disk_usage(place).free
+    try:
+        free = shutil.disk_usage(place).free
+    except OSError:
+        # Not every file system tells; a run that it does not take ends with a line about that.
+        return
     if needed > free + _held(checkpoint_folder):
         raise ConfigError(
             f"{run_dir}: takes up to {size(needed)} while it runs, but its disk has {size(free)} free; free some, "

@@ -105,7 +105,7 @@ def write_bytes(path: Path, data: bytes) -> None:
             _write(descriptor, path, data[:middle])
             _write(descriptor, path, data[middle:])
             with _step("sync", path):
-                os.fsync(descriptor)
+                _fsync(descriptor)
         finally:
             os.close(descriptor)
         with _step("rename", path):
@@ -148,7 +148,7 @@ def sync_folder(folder: Path) -> None:
     with _step("sync folder", folder):
         descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
         try:
-            os.fsync(descriptor)
+            _fsync(descriptor)
         finally:
             os.close(descriptor)
 
@@ -182,7 +182,7 @@ class Appender:
     def sync(self) -> FileDigest:
         """Waits until everything is on the disk, and says what that is."""
         with _step("sync", self._path):
-            os.fsync(self._descriptor)
+            _fsync(self._descriptor)
         return FileDigest(self._bytes, self._hash.hexdigest())
 
     def close(self) -> None:
@@ -222,6 +222,15 @@ def read_regular(path: Path, limit: int | None, count: int = -1) -> bytes:
         if limit is not None and size > limit:
             raise DamagedError(f"{path}: {size} bytes, at most {limit} expected")
         return stream.read(min(count, size) if count >= 0 else -1)
+
+
+def _fsync(descriptor: int) -> None:
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        # Such a file system has nothing to wait for, or no way to ask for it.
+        if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
+            raise
 
 
 def _write(descriptor: int, path: Path, data: bytes) -> None:

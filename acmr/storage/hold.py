@@ -7,6 +7,7 @@ that has its name by now, and whoever lost the directory writes nothing more by 
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import platform
@@ -20,6 +21,8 @@ from acmr.config import ConfigError
 from acmr.storage.processes import is_alive
 
 LOCK_FILE = ".lock"
+#: What a file system says that has no locks.
+_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 #: Seconds in which who has just taken a directory must have said so.
 _INTRODUCTION = 5.0
 #: How often a directory is looked for again that is removed while it is taken.
@@ -63,6 +66,8 @@ def hold(folder: Path) -> Iterator[None]:
         yield
     finally:
         _held.pop(folder, None)
+        with suppress(OSError):
+            os.ftruncate(descriptor, 0)
         os.close(descriptor)
 
 
@@ -87,7 +92,7 @@ def _take(folder: Path) -> int:
         except FileNotFoundError:
             continue
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(folder, descriptor)
             # Between the two calls the file may have lost its name, and another one may have it.
             if _is_at(folder, descriptor):
                 return descriptor
@@ -100,6 +105,18 @@ def _take(folder: Path) -> int:
             raise
         os.close(descriptor)
     raise OSError(0, "it is removed again and again")
+
+
+def _lock(folder: Path, descriptor: int) -> None:
+    """Locks a file; where the file system has no locks, whoever stands in it and is still there has it."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+        holder = _said(descriptor)
+        if holder is not None and holder[1] != os.getpid():
+            raise RunHeldError(f"{folder}: held by {holder[0]}; wait for it or end it") from None
 
 
 def _is_at(folder: Path, descriptor: int) -> bool:
@@ -116,9 +133,14 @@ def _holder(descriptor: int) -> str:
     deadline = time.monotonic() + _INTRODUCTION
     while time.monotonic() < deadline:
         with suppress(OSError):
-            said = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
-            match = re.match(r"process ([1-9]\d{0,8}) on (\S+) since", said)
-            if match and is_alive(int(match[1]), match[2]):
-                return said
+            if (found := _said(descriptor)) is not None:
+                return found[0]
         time.sleep(0.02)
     return "another process"
+
+
+def _said(descriptor: int) -> tuple[str, int] | None:
+    """What stands in a lock file, and the process that it names, if that is still there."""
+    said = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
+    match = re.match(r"process ([1-9]\d{0,8}) on (\S+) since", said)
+    return (said, int(match[1])) if match and is_alive(int(match[1]), match[2]) else None

@@ -122,4 +122,9 @@ def load_teacher(path: str | Path) -> Teacher:
         )
     if {str(tensor.dtype) for tensor in tensors.values()} != {f"torch.{description.precision}"}:
         raise ConfigError(f"{path}: not of the precision that {DESCRIPTION_FILE} says ({description.precision})")
+    broken = [name for name, tensor in tensors.items() if not bool(torch.isfinite(tensor).all())]
+    if broken:
+        raise ConfigError(
+            f"{path}: {broken[0]} holds numbers that are not finite; give another teacher, or train it anew"
+        )
     return Teacher(path, description, {name: tensor.float() for name, tensor in tensors.items()})
