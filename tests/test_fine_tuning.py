@@ -57,7 +57,7 @@ def test_shares_and_weights_are_straight_lines():
 
 
 @pytest.mark.parametrize("changes", GENTLE, ids=str)
-@pytest.mark.parametrize("cell", ["H1", "A2", "A3"])
+@pytest.mark.parametrize("cell", ["H1", "A2", "A3", "N1"])
 def test_both_learners_take_the_same_course(cell, changes, teacher_factory):
     assert_same_course(lambda: make_networks(cell, SIZES, teacher_factory), SACConfig(**SMALL | changes), updates=60)
 

@@ -18,7 +18,7 @@ from acmr.transfer.methods import Student, transfer
 
 SOURCE, TARGET = Dimensions(45, 9), Dimensions(31, 7)
 UPDATES = 200
-#: Method, freeze and the student's dimensions of the paper's seven cells.
+#: Method, freeze and the student's dimensions of the paper's seven cells, and of transfer by name.
 CELLS = {
     "H0": ("none", False, SOURCE),
     "H1": ("direct", False, SOURCE),
@@ -27,6 +27,7 @@ CELLS = {
     "A2": ("hidden", True, TARGET),
     "A3": ("expand", False, TARGET),
     "A4": ("expand", True, TARGET),
+    "N1": ("named", False, TARGET),
 }
 
 
@@ -70,8 +71,10 @@ def make_networks(cell: str, sizes: tuple[int, ...], teacher_factory: Callable, 
     high = np.full(dims.action, 0.4, np.float32)
     fresh = Networks(Architecture.plain(dims, sizes, -high, high), generator(5))
     teacher = None if method == "none" else teacher_factory(SOURCE, sizes)
-    config = TransferConfig(name=method, adapter_activation=activation)
-    return transfer(Student(fresh, [], []), teacher, config, freeze, generator(6)).networks
+    config = TransferConfig(name=method, adapter_activation=activation, impute="zero")
+    names = ([f"{kind}/{row}" for row in range(count)] for kind, count in
+             (("obs", dims.observation), ("action", dims.action)))  # fmt: skip
+    return transfer(Student(fresh, *names), teacher, config, freeze, generator(6)).networks
 
 
 def assert_same_course(make: Callable[[], Networks], config: SACConfig, updates: int = UPDATES) -> None:

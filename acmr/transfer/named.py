@@ -132,8 +132,8 @@ def fit_heads(networks: Networks, teacher: Teacher, actuators: PartMap) -> list[
     for name in fitted:
         layer = networks.layers()[name]
         weight, bias = SMALL * layer.weight.detach(), torch.zeros_like(layer.bias)
-        weight[list(actuators.ours)] = teacher.tensors[f"{name}.weight"][list(actuators.theirs)]
-        bias[list(actuators.ours)] = teacher.tensors[f"{name}.bias"][list(actuators.theirs)]
+        for ours, kind in ((weight, "weight"), (bias, "bias")):
+            ours[list(actuators.ours)] = teacher.tensors[f"{name}.{kind}"][list(actuators.theirs)].to(ours.dtype)
         _put(layer, weight, bias)
     return fitted
 
