@@ -173,7 +173,7 @@ class TransferConfig:
     rename: list[str] = field(default_factory=list)
     #: What those count as that the student has not (``named`` only): their ``mean``, a share of it such as ``0.75``,
     #: ``zero``, or their ``initial`` mean; ``auto`` tries some of these in the first episodes, and keeps the best.
-    impute: str = AUTO
+    impute: str = MEAN
     #: Free room for the settings of methods that are added.
     options: dict[str, Any] = field(default_factory=dict)
 
