@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 
-.PHONY: help setup test test-slow torture lint format demo paper status paper-figures report publish dashboard sync bench bench-check profile clean
+.PHONY: help setup test test-slow torture mutations lint format demo paper status paper-figures report publish dashboard sync bench bench-check profile clean
 
 help: ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
@@ -35,6 +35,9 @@ test-slow: $(READY) ## the tests that take minutes: kills, whole sweeps, Slurm
 torture: $(READY) ## five times as many kills, signals and damaged files: half an hour
 	ACMR_TORTURE=5 python -m pytest -n 2 --dist loadfile -m slow $(ARGS) \
 		tests/test_resume_kills.py tests/test_resume_writes.py tests/test_resume_damage.py
+
+mutations: $(READY) ## 5,000 changes of files of runs under the analysis: half an hour
+	ACMR_MUTATIONS=5000 python -m pytest -n 2 --dist load -m slow $(ARGS) tests/test_analysis_mutations.py
 
 lint: $(READY) ## style, imports and types
 	ruff check .
