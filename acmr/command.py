@@ -1,5 +1,7 @@
 """What every command of the project begins with: nothing that it prints can end it, and Ctrl-C ends it in one line.
 
+So does what the system refuses: a name that is too long, a folder that is gone or locked, a disk that is full.
+
 The standard library only, so that it is there before anything that takes long to load.
 """
 
@@ -15,16 +17,23 @@ from contextlib import suppress
 from functools import wraps
 from typing import TYPE_CHECKING, ParamSpec
 
+from acmr.names import terminal
+from acmr.text import without_userinfo
+
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 _Arguments = ParamSpec("_Arguments")
 #: The exit code after Ctrl-C.
 INTERRUPTED = 130
+#: The exit code of what cannot be done.
+REFUSED = 2
 
 
 def command(main: Callable[_Arguments, int]) -> Callable[_Arguments, int]:
     """Makes a function the whole of a program: with streams that never fail, and an end in one line after Ctrl-C.
+
+    An error of the system's that nobody has seen to is one line as well: it is about a file, not about the program.
 
     Args:
         main: Returns the exit code.
@@ -34,9 +43,19 @@ def command(main: Callable[_Arguments, int]) -> Callable[_Arguments, int]:
     def run(*arguments: _Arguments.args, **more: _Arguments.kwargs) -> int:
         protect_streams()
         try:
+            # Libraries ask for it as they are loaded, and some end the process where there is none.
+            os.getcwd()
+        except OSError as error:
+            return _refused(f"the current folder is gone ({error.strerror}); cd to one that is there")
+        try:
             return main(*arguments, **more)
         except KeyboardInterrupt:
             return _interrupted()
+        except OSError as error:
+            if error.errno is None:
+                raise
+            place = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes) else ""
+            return _refused(f"{place}{error.strerror}")
 
     return run
 
@@ -50,6 +69,11 @@ def end_at_ctrl_c() -> None:
     # A notebook's kernel is to stay, and who started this in the background may have chosen that Ctrl-C does nothing.
     if "IPython" not in sys.modules and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(_interrupted()))
+
+
+def _refused(reason: str) -> int:
+    print(without_userinfo(terminal(f"error: {reason}")), file=sys.stderr)
+    return REFUSED
 
 
 def _interrupted() -> int:

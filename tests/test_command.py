@@ -167,3 +167,44 @@ def test_what_can_be_shown_is_shown_whole(tmp_path: Path) -> None:
     assert done.stdout.decode() == "from C" + "☃" * 20000 + "\n"
     assert "UserWarning: ☃" in done.stderr.decode()
     assert done.stderr.decode().endswith("☃\n☃")
+
+
+LONG = "n" * 300
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        f"-m sweeps.status {LONG}",
+        f"-m acmr.tracking.mirror dashboard {LONG}",
+        f"-m acmr.tracking.mirror sync --base-url http://127.0.0.1:9 {LONG}",
+        f"-m acmr.transfer.half $RUNS/evaluated/ant_three_legs-none/seed_1 {LONG}",
+        f"-m acmr.evaluation {LONG}",
+        f"-m analysis {LONG}",
+        f"run.py +env.kwargs.{LONG}=1",
+        f"run.py --config-name={LONG}",
+        f"run.py --config-dir={LONG}",
+        f"run.py hydra.searchpath=[{LONG}]",
+        f"run.py matrix={LONG}",
+    ],
+    ids=lambda command: command.replace(LONG, "300"),
+)
+def test_a_name_that_no_file_has_is_one_line(command: str, runs: Path) -> None:
+    done = shell(command.replace("$RUNS", f"'{runs}'"), "", runs)
+    assert done.returncode == 2
+    (line,) = done.stderr.decode().splitlines()
+    assert LONG in line
+    assert "File name too long" in line
+
+
+@pytest.mark.parametrize("command", ["-m sweeps.status", "-m acmr.envs", "-m acmr.evaluation runs", "{run}"])
+def test_a_current_folder_that_is_gone_is_one_line(command: str, tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    line = f"cd {gone} && rmdir {gone} && {sys.executable} {command.format(run=ROOT / 'run.py')}"
+    variables = {**ENVIRONMENT, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(["bash", "-c", line], env=variables, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        "error: the current folder is gone (No such file or directory); cd to one that is there"
+    ]

@@ -20,6 +20,15 @@ def test_an_unfinished_tracker_does_not_keep_a_process(tmp_path: Path) -> None:
     assert len(history(the_mirror(tmp_path / "out"))) == 1
 
 
+def test_a_folder_whose_name_is_no_text_costs_one_line(tmp_path: Path) -> None:
+    out = tmp_path / os.fsdecode(b"n\xff")
+    process = child("start().close({})", out, home=tmp_path)
+    said, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+    (line,) = said.splitlines()
+    assert line.startswith("WARNING W&B mirror not started: UnicodeEncodeError")
+
+
 def test_kill_9_costs_the_last_second_at_most(tmp_path: Path) -> None:
     program = """
         tracker = start()

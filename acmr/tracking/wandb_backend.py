@@ -163,6 +163,8 @@ def _start(arguments: Mapping[str, Any], folder: Path, server: str | None) -> Ru
 
         # W&B has its own log files; a run's log and its terminal are no place for it.
         logging.getLogger("wandb").propagate = False
+        # A line that such a file does not take, as of a path that is no text, is lost there and no matter for the user.
+        logging.raiseExceptions = False
         settings = wandb.Settings(
             mode="online" if server else "offline",
             # W&B leaves all but the last second of a killed run.

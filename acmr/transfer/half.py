@@ -12,6 +12,7 @@ from pathlib import Path
 from acmr.command import command
 from acmr.config import ConfigError
 from acmr.names import terminal
+from acmr.storage.durable import WriteError
 from acmr.transfer.teacher import load_teacher, save_halved
 
 
@@ -24,7 +25,7 @@ def main() -> int:
     given = parser.parse_args()
     try:
         save_halved(given.out, load_teacher(given.run_dir))
-    except (ConfigError, OSError) as error:
+    except (ConfigError, WriteError) as error:
         print(terminal(f"error: {error}"), file=sys.stderr)
         return 2
     return 0
