@@ -17,6 +17,9 @@ from urllib.parse import quote
 _BYTES, _NO_TEXT = range(0xDC80, 0xDD00), 0xDC00
 #: Signs that Markdown, with tables, mathematics and HTML in it, does not leave as they are.
 _MARKDOWN = re.compile(r"[\\`*<>\[\]|&~$]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
+#: What a spreadsheet computes: an equal sign and the like where a cell begins, the wide ones of Chinese and Japanese
+#: included. Where a spreadsheet of another country parts cells the writer quotes nothing.
+_FORMULA = re.compile(r"(^|[;|])( *[=+\-@\uff1d\uff0b\uff0d\uff20])")
 _LATEX = {
     **{sign: f"\\{sign}" for sign in "{}$&#%_"},
     "\\": r"\textbackslash{}",
@@ -67,9 +70,8 @@ def latex(name: str) -> str:
 
 
 def csv_cell(name: str) -> str:
-    """A name for a CSV file; what a spreadsheet would compute begins with an apostrophe. Quoting is the writer's."""
-    text = terminal(name)
-    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
+    """A name for a CSV file; what a spreadsheet would compute has an apostrophe before it. Quoting is the writer's."""
+    return _FORMULA.sub(r"\1'\2", terminal(name))
 
 
 def distinct(names: Iterable[str], ending: str | None = None) -> dict[str, str]:

@@ -9,7 +9,6 @@ import gzip
 import hashlib
 import json
 import os
-import stat
 import zlib
 from collections.abc import Mapping
 from contextlib import suppress
@@ -17,8 +16,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from acmr.foreign import most_of
-from acmr.records import EPISODE_FILES, FILES_ENTRY, SEAL_ENTRY, SEALED_FILES, SEED_FOLDER, SUMMARY_FILE
+from acmr.foreign import is_there, most_of, opened
+from acmr.records import (
+    EPISODE_FILES,
+    FILES_ENTRY,
+    SEAL_ENTRY,
+    SEALED_FILES,
+    SEED_FOLDER,
+    SUMMARY_FILE,
+    DamagedError,
+)
 
 #: Folders that hold other files of the same names (of W&B, Python); those whose name begins with a dot are, too.
 PASSED_OVER = ("wandb", "__pycache__")
@@ -174,23 +181,20 @@ def _change(directory: Path, name: str, digest: Any) -> str:
     if not isinstance(size, int) or not isinstance(sha256, str) or size > most_of(name):
         return f"{SUMMARY_FILE} does not say what {name} was"
     path, packed = directory / name, directory / f"{name}.gz"
-    is_packed = not os.path.lexists(path) and os.path.lexists(packed)
+    is_packed = not is_there(path) and is_there(packed)
+    if not is_packed and not is_there(path):
+        return f"{name} is missing"
     try:
-        # Not to wait for the writer of a pipe that somebody has put there.
-        descriptor = os.open(packed if is_packed else path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        with open(descriptor, "rb") as stream:
-            status = os.fstat(descriptor)
-            if not stat.S_ISREG(status.st_mode):
-                return f"{name} is no file"
-            if not is_packed and status.st_size != size:
-                return f"{name} has {status.st_size:,} bytes, not the {size:,} that it had when the run ended"
+        with opened(packed if is_packed else path, name) as (stream, length):
+            if not is_packed and length != size:
+                return f"{name} has {length:,} bytes, not the {size:,} that it had when the run ended"
             if is_packed:
                 with gzip.open(stream) as content:
                     same = _sha256(content, size) == sha256
             else:
                 same = _sha256(stream, size) == sha256
-    except FileNotFoundError:
-        return f"{name} is missing"
+    except DamagedError as error:
+        return str(error)
     except (OSError, EOFError, zlib.error) as error:
         return f"{name} cannot be read ({getattr(error, 'strerror', None) or error})"
     return "" if same else f"{name} was changed since the run ended"
