@@ -29,6 +29,18 @@ settings.register_profile("acmr", deadline=None)
 settings.load_profile("acmr")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks further examples of costly tests as slow, so that the fast suite sees each kind once."""
+    seen = set()
+    for item in items:
+        if item.get_closest_marker("first_is_fast"):
+            test = item.nodeid.split("[")[0]
+            if test in seen:
+                item.add_marker(pytest.mark.slow)
+            seen.add(test)
+
+
 @pytest.fixture(autouse=True)
 def _settings_of_the_project() -> Iterator[None]:
     """What a command line says of places of settings files holds for one test."""

@@ -105,6 +105,7 @@ def test_without_censoring_the_band_is_the_exact_one_of_a_share(n):
 
 @pytest.mark.parametrize("n", [3, 6, 20])
 @pytest.mark.parametrize("censoring", [1.5, 3.0, 100.0])
+@pytest.mark.first_is_fast
 def test_the_band_of_a_share_covers_where_runs_are_censored(n, censoring):
     rng, hits = np.random.default_rng(0), []
     for _ in range(1000):
@@ -128,6 +129,7 @@ def printed(folder: Path, name: str) -> dict[str, list[str]]:
     return {row[column]: row for row in rows}
 
 
+@pytest.mark.slow
 def test_a_mean_of_the_fast_runs_is_marked_wherever_it_is_printed(tmp_path, capsys):
     write_matrix(tmp_path / "runs", TIMES, total=TOTAL, length=100)
     out = tmp_path / "out"
@@ -163,6 +165,7 @@ def test_a_mean_of_the_fast_runs_is_marked_wherever_it_is_printed(tmp_path, caps
     assert (rows["A3"]["n_index"], float(rows["A3"]["mean_index"])) == ("2", 3050)
 
 
+@pytest.mark.slow
 def test_where_every_run_reached_nothing_is_marked(tmp_path, capsys):
     times = {cell: values for cell, values in TIMES.items() if cell in ("A0", "A2")}
     write_matrix(tmp_path / "runs", times, total=TOTAL, length=100)

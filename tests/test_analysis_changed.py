@@ -80,6 +80,7 @@ def test_every_changed_digit_of_the_episodes_is_told(root):
 
 
 @pytest.mark.parametrize("column", [0, 2])
+@pytest.mark.first_is_fast
 def test_of_older_runs_steps_and_lengths_that_do_not_agree_are_told(column, root, capsys):
     def change(folder: Path) -> None:
         lines = (folder / "episodes.csv").read_text().splitlines()
@@ -124,6 +125,7 @@ def test_settings_cut_off_at_any_line_tell_no_other_initial_return(sealed, root)
 
 
 @pytest.mark.parametrize("sealed", [True, False])
+@pytest.mark.first_is_fast
 def test_settings_that_are_gone_leave_the_initial_return_unknown(sealed, root, capsys):
     before, after = changed(root, lambda folder: (folder / "config.yaml").unlink(), sealed)
     assert (after["counted"], after["state"]) == (True, "complete")
@@ -182,6 +184,7 @@ def test_settings_that_were_changed_are_not_used(name, old, new, root):
         ('"env": "armless_humanoid"', '"env": "humanoid"', "env humanoid, config.yaml env armless_humanoid"),
     ],
 )
+@pytest.mark.first_is_fast
 def test_older_runs_whose_files_contradict_each_other_are_damaged(old, new, said, root, capsys):
     _, after = changed(root, replaced("summary.json", old, new), sealed=False)
     assert (after["state"], after["counted"], after["cell"], after["seed"]) == ("damaged", False, "A2", 2)
@@ -198,6 +201,7 @@ def test_older_runs_whose_files_contradict_each_other_are_damaged(old, new, said
         lambda folder: (folder / "metrics.csv").write_text("global_step,steps_per_second\n100,5\n"),
     ],
 )
+@pytest.mark.first_is_fast
 def test_of_changed_metrics_no_speed_is_shown(change, root):
     seal(run_directory(root, "A2", 2))
     data = analyze(load(root)).measured

@@ -40,6 +40,7 @@ def test_the_same_figure_has_the_same_bytes(tmp_path):
         assert one.read_bytes() == two.read_bytes()
 
 
+@pytest.mark.slow
 def test_figures_2_and_3_are_rendered_or_one_line_says_what_is_missing(tmp_path):
     rendering = stills.start(("humanoid", "no_such_robot"), tmp_path)
     (image, problem), (nothing, line) = (stills.finish(still) for still in rendering)
@@ -54,6 +55,7 @@ def test_figures_2_and_3_are_rendered_or_one_line_says_what_is_missing(tmp_path)
     assert "\n" not in line
 
 
+@pytest.mark.slow
 def test_results_are_not_made_again_if_nothing_has_changed(tmp_path, monkeypatch, capsys):
     directory = write_run(tmp_path / "runs" / "paper", "A0", 1, rows_reaching(6000, 20_000), total=20_000)
     monkeypatch.chdir(tmp_path)
@@ -177,6 +179,7 @@ def test_a_setting_that_some_runs_were_made_before_is_found(tmp_path):
     assert differing.to_dict("records") == [{"setting": "stop", "A0": "horizon", "A2": "threshold"}]
 
 
+@pytest.mark.slow
 def test_any_part_of_the_matrix_makes_a_report(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for number, cell in enumerate(CELLS):

@@ -49,6 +49,7 @@ def is_biased(analysis: Analysis, cell: str = "A2") -> bool:
         ({}, "and seeds 2 (missing), 3 (missing) have not ended"),
     ],
 )
+@pytest.mark.first_is_fast
 def test_a_cell_of_which_the_fast_runs_have_ended_is_biased(root, others, said):
     ended(root, 1, 6000)
     for seed, step in others.items():
@@ -114,6 +115,7 @@ def test_a_run_that_has_reached_but_not_ended_is_known(root):
 
 
 @pytest.mark.parametrize(("steps", "used"), [({4: 7000}, (1, 2, 3)), ({4: 7000, 5: 7500}, (1, 2, 3, 4, 5))])
+@pytest.mark.first_is_fast
 def test_further_seeds_wait_for_one_another_while_the_papers_are_used(root, steps, used):
     for seed, reached in {1: 6000, 2: 6300, 3: 5900, **steps}.items():
         ended(root, seed, reached)
@@ -138,6 +140,7 @@ def test_the_reference_may_be_the_biased_one(tmp_path):
 
 
 @pytest.mark.parametrize("asked", [4900.0, 100.0])
+@pytest.mark.first_is_fast
 def test_the_slowest_is_the_one_that_ended_last_whatever_is_asked_for(root, asked):
     for seed, steps in ((1, 6000), (2, 6300)):
         ended(root, seed, steps)
@@ -159,6 +162,7 @@ def test_what_is_typed_goes_on_as_the_runs_began(root):
     assert matrix_command(data) == f"python run.py matrix=paper experiment=H0,H1,A1,A2,A3,A4 seed=1,2,3 {stop}"
 
 
+@pytest.mark.slow
 def test_the_mark_is_seen_wherever_the_cell_is(root, tmp_path, capsys):
     ended(root, 1, 6000)
     under_way(root, 2, 500)

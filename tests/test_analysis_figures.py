@@ -108,6 +108,7 @@ def outside(axis: Axis) -> Iterator[Text]:
 
 @pytest.mark.parametrize("palette", PALETTES, ids=lambda palette: palette.name)
 @pytest.mark.parametrize("spec", FIGURES, ids=lambda spec: spec.name)
+@pytest.mark.first_is_fast
 def test_no_text_overlaps_another_or_leaves_the_figure(data: FigureData, spec: FigureSpec, palette):
     figure = spec.draw(data, palette)
     if figure is None:

@@ -116,6 +116,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.slow
 def test_names_of_every_kind_go_through_the_whole_analysis(tmp_path, capsys, recwarn, seed):
     root, out = tmp_path / "runs", tmp_path / "results"
     names = names_of(seed)
@@ -202,6 +203,7 @@ def contents(folder: Path) -> dict[str, bytes | None]:
         ("write_report", ValueError("x")),
     ],
 )
+@pytest.mark.first_is_fast
 def test_a_failure_leaves_the_earlier_results(results, monkeypatch, capsys, step, error):
     def fail(*arguments):
         raise error
@@ -221,6 +223,7 @@ def test_a_failure_leaves_the_earlier_results(results, monkeypatch, capsys, step
     monkeypatch.undo()
 
 
+@pytest.mark.slow
 def test_new_results_take_the_places_of_earlier_ones_and_leave_what_is_not_theirs(results):
     before = contents(results)
     (results / "comparisons.csv").write_text("of a group that is gone")

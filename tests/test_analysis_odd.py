@@ -69,6 +69,7 @@ def check(
 
 
 @pytest.mark.parametrize("key", SUMMARY)
+@pytest.mark.first_is_fast
 def test_a_number_out_of_range_in_a_summary_is_listed(root, capsys, key):
     value, reason = SUMMARY[key]
     write_run(root, "A0", 3, ROWS, total=20_000, summary={key: value})
@@ -76,6 +77,7 @@ def test_a_number_out_of_range_in_a_summary_is_listed(root, capsys, key):
 
 
 @pytest.mark.parametrize("key", CONFIG)
+@pytest.mark.first_is_fast
 def test_a_number_out_of_range_in_settings_is_listed(root, capsys, key):
     value, reason = CONFIG[key]
     write_odd(root, "A0", 3, {key: value})
@@ -83,6 +85,7 @@ def test_a_number_out_of_range_in_settings_is_listed(root, capsys, key):
 
 
 @pytest.mark.parametrize(("key", "value"), [("wall_seconds", -1e300), ("steps_per_second", math.nan)])
+@pytest.mark.slow
 def test_a_number_that_can_be_left_out_is(root, capsys, key, value):
     write_run(root, "A0", 3, ROWS, total=20_000, summary={key: value})
     check(root, f"summary.json: {key} is {value}, not a number from 0 to 1e+12, and is left out", capsys, counted=True)
@@ -98,6 +101,7 @@ def nested(depth: int) -> dict:
 
 @pytest.mark.parametrize("depth", [40, 200, 900, 100_000])
 @pytest.mark.parametrize("name", ["summary.json", "config.yaml"])
+@pytest.mark.first_is_fast
 def test_settings_within_settings_are_listed(root, capsys, depth, name):
     folder = write_run(root, "A0", 3, ROWS, total=20_000)
     (folder / name).write_text('{"a": ' * depth + "1" + "}" * depth)
@@ -105,6 +109,7 @@ def test_settings_within_settings_are_listed(root, capsys, depth, name):
 
 
 @pytest.mark.parametrize("number", ["0x" + "f" * 5000, "9" * 5000, "1" + "0" * 2000])
+@pytest.mark.first_is_fast
 def test_a_number_that_cannot_be_printed_is_listed(root, capsys, number):
     folder = write_run(root, "A0", 3, ROWS, total=20_000)
     with (folder / "config.yaml").open("a") as file:
@@ -113,6 +118,7 @@ def test_a_number_that_cannot_be_printed_is_listed(root, capsys, number):
 
 
 @pytest.mark.parametrize("name", [f"seed_{SEED}", "seed_99999999999999999999"])
+@pytest.mark.first_is_fast
 def test_a_folder_with_a_seed_out_of_range_is_listed(root, capsys, name):
     (root / "A0" / name).mkdir(parents=True)
     (root / "A0" / name / "episodes.csv").write_text("global_step,episodic_return,episode_length\n10,1.0,10\n")
@@ -128,6 +134,7 @@ def test_a_seed_that_is_no_number_is_that_of_the_folder(root, seed):
     assert load(root).runs.loc["armless_humanoid-none/seed_3", "seed"] == 3
 
 
+@pytest.mark.slow
 def test_an_odd_run_decides_neither_threshold_nor_profile(root, capsys):
     folder = write_run(root, "A0", 3, ROWS, total=20_000, summary={"threshold": 7.0, "profile": "other"})
     (folder / "episodes.csv").write_text("nonsense\n")
@@ -152,6 +159,7 @@ def test_a_report_is_made_of_any_of_them(root, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("value", [1e308, -1e200, math.inf])
+@pytest.mark.first_is_fast
 def test_absurd_returns_meet_no_threshold_and_spoil_no_number(root, capsys, value):
     rows = ROWS.copy()
     rows[::2, 1] = value

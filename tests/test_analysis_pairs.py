@@ -66,6 +66,7 @@ def test_each_number_of_a_paired_comparison(tmp_path):
     assert table.loc[("A2", "A3"), "slower"] == 2
 
 
+@pytest.mark.slow
 def test_equal_first_episodes_are_counted(tmp_path):
     for cell, change in (("A0", 0.0), ("A2", 1.0), ("A3", 5.0)):
         for seed in (1, 2):
@@ -102,6 +103,7 @@ def test_one_pair_has_no_test(tmp_path):
         ((None, None, None), (9000, 8000, None), (2, 0, 1)),
     ],
 )
+@pytest.mark.first_is_fast
 def test_runs_that_never_got_there_keep_their_order_and_give_restricted_means(tmp_path, first, second, expected):
     write_matrix(tmp_path, {"A0": first, "A2": second}, total=TOTAL, length=100)
     row = paired_of(tmp_path).loc[("A0", "A2")]
@@ -112,6 +114,7 @@ def test_runs_that_never_got_there_keep_their_order_and_give_restricted_means(tm
     assert row["p_restricted"] == pytest.approx(sign_flip_p(*map(np.float64, within)))
 
 
+@pytest.mark.slow
 def test_runs_that_stopped_before_another_threshold_tell_their_order_only(tmp_path):
     # At 4900 all reach it; beyond that the runs of A2 end where nothing is known of them yet.
     for seed, (slow, fast) in enumerate(((9000, 6000), (9500, 7000), (6000, 8000)), start=1):

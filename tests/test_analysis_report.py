@@ -24,6 +24,8 @@ from analysis_outputs import FIGURES, TABLES
 from analysis_runs import csv_text, realistic_rows, run_directory, write_realistic
 from PIL import Image
 
+#: One analysis with all its pictures, and a browser.
+pytestmark = pytest.mark.slow
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 OPTIONS = [
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),

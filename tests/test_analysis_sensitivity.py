@@ -116,6 +116,7 @@ def test_a_run_shorter_than_the_window_meets_nothing_and_an_empty_one_neither():
 
 
 @pytest.mark.parametrize(("limit", "count"), [(4500, 1), (4900, 5), (5000, 3), (5100, 3)])
+@pytest.mark.first_is_fast
 def test_each_difference_is_that_of_an_analysis_with_this_threshold(full, limit, count):
     root, points = full
     assert set(points["basis"]) == {ALL}
@@ -133,6 +134,7 @@ def test_each_difference_is_that_of_an_analysis_with_this_threshold(full, limit,
 
 
 @pytest.mark.parametrize("cut", [("A2",), ("A0", "A2"), ("A0", "A2", "H0")])
+@pytest.mark.first_is_fast
 def test_runs_that_stopped_say_what_the_full_ones_say_or_nothing(tmp_path, full, cut):
     write_study(tmp_path, cut)
     points = points_of(tmp_path)
@@ -149,6 +151,7 @@ def test_runs_that_stopped_say_what_the_full_ones_say_or_nothing(tmp_path, full,
     assert (asked["measure_x"] == MEANS).all()
 
 
+@pytest.mark.slow
 def test_the_full_runs_alone_stand_beside_all(tmp_path):
     write_study(tmp_path / "cut", ("A0", "A2"))
     for cell, half in (("A0", 5000), ("A2", 4000)):
@@ -161,6 +164,7 @@ def test_the_full_runs_alone_stand_beside_all(tmp_path):
     assert set(points.loc[(points["index"] == "H0") & (points["basis"] == FULL), "runs_index"]) == {3}
 
 
+@pytest.mark.slow
 def test_a_cell_of_which_the_fast_runs_have_ended_has_no_difference(tmp_path):
     for seed, steps in enumerate((8000, 9000, 10_000), start=1):
         write_cut(tmp_path, "A0", seed, rows_reaching(steps, TOTAL), TOTAL)

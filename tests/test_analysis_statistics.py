@@ -151,6 +151,7 @@ def test_the_interval_of_g_inverts_the_noncentral_t(t, df, probability):
 
 
 @pytest.mark.parametrize(("n", "m", "truth"), [(2, 2, 1.0), (2, 2, 3.0), (3, 3, 3.0), (2, 4, -3.0), (5, 5, 0.0)])
+@pytest.mark.first_is_fast
 def test_the_interval_of_g_covers_as_often_as_it_says(n, m, truth):
     rng = np.random.default_rng(0)
     effects = [hedges_g(rng.normal(0, 1, n), rng.normal(truth, 1, m)) for _ in range(800)]

@@ -52,6 +52,7 @@ KEPT = [
 
 @settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.integers(0, 2**32 - 1), st.sampled_from([None, 14_000]), st.booleans())
+@pytest.mark.slow
 def test_cutting_runs_at_their_threshold_changes_nothing_that_is_asked_of_steps(tmp_path_factory, seed, after, mixed):
     root = tmp_path_factory.mktemp("runs")
     rng = np.random.default_rng(seed)

@@ -52,6 +52,7 @@ def test_what_cannot_be_tested_for_likeness_has_no_p(samples):
     assert math.isnan(tost(*samples, 1.0).p)
 
 
+@pytest.mark.slow
 def test_the_margin_is_a_twentieth_of_a_full_run_unless_it_is_given(tmp_path):
     write_matrix(tmp_path, {"A0": (8000, 8100, 8050), "A1": (8020, 8110, 8060)}, total=TOTAL, length=100)
     write_cut(tmp_path, "A2", 1, rows_reaching(7000, TOTAL), TOTAL)
@@ -79,6 +80,7 @@ def test_a_published_t_is_the_effect_of_samples_that_have_it(t):
 
 
 @pytest.mark.parametrize(("n", "true"), [(3, 0.0), (3, 3.0), (5, 1.0)])
+@pytest.mark.first_is_fast
 def test_the_predicted_interval_covers_what_it_says(n, true):
     """The next study's g lies in 95% of all intervals; 120 pairs of studies leave a standard error of 0.02."""
     rng = np.random.default_rng(int(10 * n + true))
@@ -183,6 +185,7 @@ def test_a_damaged_report_of_a_transfer_is_no_error(tmp_path):
         assert math.isnan(table.loc["A2", "teacher_steps"])
 
 
+@pytest.mark.slow
 def test_the_summary_prints_the_study(tmp_path, capsys):
     write_matrix(tmp_path, {"A0": (8000, 9000), "A2": (6000, 7000)}, total=TOTAL, length=100)
     for seed in (1, 2):

@@ -56,6 +56,7 @@ def analysis_of(root, times, **options) -> Analysis:
 
 @pytest.mark.filterwarnings("ignore:Precision loss:RuntimeWarning")
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.first_is_fast
 def test_every_number_matches_scipy(tmp_path, case):
     times = CASES[case]
     table = analysis_of(tmp_path, times).table3
@@ -194,6 +195,7 @@ def test_the_published_table_is_the_papers():
     assert table["source"].str.contains("Table 3").all()
 
 
+@pytest.mark.first_is_fast
 def test_agreement_with_the_published_table(tmp_path):
     both = side_by_side(analysis_of(tmp_path, PAPER_LIKE).table3)
     assert both["sign"].tolist() == ["agrees"] * 6

@@ -163,6 +163,7 @@ def test_settings_of_any_shape_are_no_cell(odd, tmp_path):
     assert only(tmp_path)["cell"] is None
 
 
+@pytest.mark.slow
 def test_an_own_cell_is_planned_where_it_has_runs(mine, tmp_path):
     assert [cell.name for cell in planned_cells([])] == PAPER
     write_run(tmp_path, "A0", 1, rows_reaching(6000, TOTAL), total=TOTAL)
@@ -194,6 +195,7 @@ def test_an_own_cell_is_compared_with_its_baseline_in_its_family(mine, tmp_path)
     assert "over 5 comparisons" in about_n(analysis.table3, analysis.data.cells)[-1]
 
 
+@pytest.mark.slow
 def test_another_baseline_and_a_family_of_its_own(mine, monkeypatch, tmp_path):
     monkeypatch.setitem(CELLS, "B1", replace(mine, baseline="A2", family="rates"))
     analysis = analysis_of(tmp_path)

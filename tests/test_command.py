@@ -59,6 +59,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("useless", USELESS.values(), ids=USELESS)
 @pytest.mark.parametrize("command", ["-m sweeps.status $RUNS", "-m analysis $RUNS/quick --summary", "run.py sed=1"])
+@pytest.mark.first_is_fast
 def test_what_is_shown_ends_no_command(command: str, useless: str, runs: Path) -> None:
     done = shell(command.replace("$RUNS", '"$RUNS"'), useless, runs)
     assert ended_well(done, 2 if "run.py" in command else 0), (done.returncode, done.stderr.decode())
@@ -76,6 +77,7 @@ def test_what_is_shown_ends_no_command(command: str, useless: str, runs: Path) -
         ("run.py --help", ">/dev/full 2>&1"),
     ],
 )
+@pytest.mark.first_is_fast
 def test_the_other_commands_do_their_work_too(command: str, useless: str, runs: Path) -> None:
     done = shell(command.replace("$RUNS", f"'{runs}'"), useless, runs)
     assert ended_well(done), (done.returncode, done.stderr.decode())
@@ -85,6 +87,7 @@ def test_the_other_commands_do_their_work_too(command: str, useless: str, runs: 
 
 
 @pytest.mark.parametrize("useless", [">/dev/full 2>&1", "<&- >&- 2>&-"])
+@pytest.mark.first_is_fast
 def test_a_training_comes_to_its_end(useless: str, tmp_path: Path) -> None:
     done = shell(TRAINING.replace("$RUNS", f"'{tmp_path / FOLDER}'"), useless, tmp_path)
     assert ended_well(done), (done.returncode, done.stderr.decode())
@@ -92,6 +95,7 @@ def test_a_training_comes_to_its_end(useless: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+@pytest.mark.first_is_fast
 def test_a_terminal_that_goes_away_or_has_another_encoding(encoding: str, tmp_path: Path) -> None:
     parent, child = pty.openpty()
     words = [*TRAINING.split()[:-1], f"output_dir={tmp_path / FOLDER}"]

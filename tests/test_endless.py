@@ -44,6 +44,7 @@ def run(folder: Path, env_id: str, *more: str) -> Run:
         ("AcmrOwnLimit-v0", (), False, True),
     ],
 )
+@pytest.mark.first_is_fast
 def test_a_run_says_that_no_episode_may_end_and_that_none_did(
     env_id: str, more: tuple[str, ...], warned: bool, ends: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -101,6 +101,7 @@ def test_errors_are_one_line(
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_guide(tmp_path: Path) -> None:
     folder = copy_checkout(tmp_path / "checkout")
     said = follow(ROOT / "docs" / "howto-environment.md", folder)

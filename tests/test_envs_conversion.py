@@ -121,6 +121,7 @@ def test_what_the_environment_overwrites_stays_what_it_was(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["Keeping", "Changing", "KeepingParts", "Wrapped"])
+@pytest.mark.first_is_fast
 def test_a_run_in_it_is_that_of_one_that_gives_copies(name: str, tmp_path: Path) -> None:
     runs = [
         Run(tmp_path / each, ("env=gym", f"env.id=Acmr{each}-v0", "total_timesteps=160", *SMALL))

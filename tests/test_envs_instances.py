@@ -37,6 +37,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 
 @pytest.mark.parametrize("words", [["env=humanoid"], ["env=ant", "env.drop_actuators=[0]", "env.drop_sensors=[0]"]])
+@pytest.mark.slow
 def test_a_run_builds_its_environment_three_times_before_the_first_step(words: list[str], tmp_path: Path) -> None:
     """One is tried out and plays for the check, one is put into its state, and one is trained in."""
     command = [sys.executable, "-c", COUNTING, str(ROOT / "run.py"), *words, "total_timesteps=1", "tracking=off"]

@@ -43,6 +43,7 @@ def test_a_signal_waits_for_the_end_of_the_episode_where_that_is_needed(tmp_path
     assert "stopped by SIGTERM at step 60" in ended.said
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_terminal_reaches_the_whole_group(tmp_path):
     words = [word for word in ANT if not word.startswith(("total", "tracking"))]
     command = [sys.executable, str(ROOT / "run.py"), f"output_dir={tmp_path}", "total_timesteps=100000", *words]

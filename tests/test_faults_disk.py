@@ -24,6 +24,7 @@ def error_of(said: str) -> str:
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EDQUOT])
+@pytest.mark.first_is_fast
 def test_a_disk_that_takes_no_checkpoint(code, tmp_path, untouched):
     run = Run(tmp_path, ANT)
     count = tmp_path / "writes"
@@ -121,6 +122,7 @@ def test_a_disk_that_fills_up_and_is_freed(small_disk, untouched):
     same(run.finish(), untouched(ANT))
 
 
+@pytest.mark.slow
 def test_a_disk_that_may_only_be_read(small_disk, untouched):
     run = Run(small_disk / "runs", ANT)
 

@@ -58,6 +58,7 @@ def test_shares_and_weights_are_straight_lines():
 
 @pytest.mark.parametrize("changes", GENTLE, ids=str)
 @pytest.mark.parametrize("cell", ["H1", "A2", "A3", "N1"])
+@pytest.mark.first_is_fast
 def test_both_learners_take_the_same_course(cell, changes, teacher_factory):
     assert_same_course(lambda: make_networks(cell, SIZES, teacher_factory), SACConfig(**SMALL | changes), updates=60)
 
@@ -99,6 +100,7 @@ def test_critics_learn_alone_at_first(kind, teacher_factory):
 
 
 @pytest.mark.parametrize("kind", LEARNERS)
+@pytest.mark.first_is_fast
 def test_the_penalty_keeps_the_policy_near_until_it_has_faded(kind, teacher_factory):
     probe = torch.randn(200, make_networks("A1", SIZES, teacher_factory).dims.observation, generator=generator(9))
 
@@ -126,6 +128,7 @@ def test_a_state_goes_on_bit_for_bit_whatever_the_networks_were(kind, teacher_fa
 
 
 @pytest.mark.parametrize("step", [110, 170])
+@pytest.mark.slow
 def test_a_killed_run_goes_on_bit_for_bit(step: int, tmp_path: Path) -> None:
     words = (*ANT, "agent.warmup=80", "agent.critics_first=30")
     whole, killed = Run(tmp_path / "whole", words), Run(tmp_path / "killed", words)

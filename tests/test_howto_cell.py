@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 from guides import ROOT, blocks, copy_checkout, do
 
+#: A copy of the project, with trainings and an analysis of its own.
+pytestmark = pytest.mark.slow
 GUIDE = ROOT / "docs" / "howto-cell.md"
 #: As the trainings of the guide would, lays out runs of A0, A2 and A5; with the rows of the copy.
 RUNS = """

@@ -125,6 +125,7 @@ def test_what_is_there_is_neither_made_again_nor_touched(runs, tmp_path):
     ("arguments", "taken"),
     [(["--episodes", "20"], True), (["--episodes", "3"], False), (["--episodes", "20", "--stochastic"], False)],
 )
+@pytest.mark.first_is_fast
 def test_an_evaluation_that_a_run_has_is_taken_if_it_is_the_one_that_is_wanted(runs, tmp_path, arguments, taken):
     said: list[str] = []
     assert evaluate([str(published(runs, "A1")), *arguments]) == 0
@@ -145,6 +146,7 @@ def test_networks_are_added_to_a_run_that_was_published_without(runs, tmp_path):
     assert precision_of(published(out, "A0")) == "float16"
 
 
+@pytest.mark.slow
 def test_other_networks_of_a_run_are_not_overwritten(runs, tmp_path):
     out, own = tmp_path / "out", published(runs, "A0").parent
     publish(own, published(out, "A0").parent)
@@ -155,6 +157,7 @@ def test_other_networks_of_a_run_are_not_overwritten(runs, tmp_path):
     assert (published(out, "A0") / "teacher.json").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_what_would_be_too_large_for_a_clone_is_refused_before_anything_is_written(runs, tmp_path, monkeypatch, capsys):
     out = tmp_path / "results" / "quick"
     other = tmp_path / "results" / "paper" / "x" / "seed_1"

@@ -71,6 +71,7 @@ def test_the_tables_on_that_page_are_what_its_command_prints():
     assert results.filled(results.PAGE.read_text()) == results.PAGE.read_text(), "type python -m docs.results"
 
 
+@pytest.mark.slow
 def test_a_student_learns_from_the_published_teacher(tmp_path):
     command = [sys.executable, "run.py", "experiment=A2", f"transfer.teacher={TEACHER.relative_to(ROOT)}"]
     command += ["total_timesteps=60", "agent.learning_starts=40", "agent.buffer_size=60", "agent.batch_size=8"]
@@ -98,5 +99,7 @@ def test_the_published_runs_are_taken_up_by_the_matrix(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, env=dict(os.environ))
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
-    assert sum(line.startswith("complete ") for line in lines) == len(RUNS)
-    assert sum("seed" in line and not line.startswith("complete ") for line in lines) == 21 - len(RUNS)
+    # The matrix is the paper's; what goes beyond it is published too.
+    papers = [run for run in RUNS if "-named" not in run.parent.name]
+    assert sum(line.startswith("complete ") for line in lines) == len(papers)
+    assert sum("seed" in line and not line.startswith("complete ") for line in lines) == 21 - len(papers)

@@ -53,6 +53,7 @@ def stopped(tmp_path) -> Run:
         ("plain", [54, 130], [40, 120]),  # the learner whose state is that of torch's own networks and optimizers
     ],
 )
+@pytest.mark.first_is_fast
 def test_kills_leave_no_trace(kind, kills, resumed, untouched, tmp_path):
     run, seen = Run(tmp_path, KINDS[kind]), []
     for kill in kills:
@@ -73,6 +74,7 @@ def test_an_environment_that_is_stored_between_episodes_says_so_once(tmp_path):
 
 
 @pytest.mark.parametrize("transfer", ["hidden", "expand"])
+@pytest.mark.first_is_fast
 def test_a_student_with_frozen_layers(transfer, untouched, tmp_path):
     teacher = untouched(ANT)[1]
     overrides = (
@@ -240,6 +242,7 @@ def logged_steps(mirror: Path) -> list[tuple[int, str]]:
     return [(int(row["global_step"]), "episode" if "episodic_return" in row else "metrics") for row in rows]
 
 
+@pytest.mark.slow
 def test_the_processes_of_these_tests_do_what_run_py_does(stopped, untouched, tmp_path):
     root = Path(__file__).resolve().parent.parent
     command = [sys.executable, str(root / "run.py"), f"output_dir={stopped.output}", *ANT]

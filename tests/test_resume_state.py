@@ -46,6 +46,7 @@ def same(first: object, second: object) -> bool:
 
 @settings(max_examples=50)
 @given(states)
+@pytest.mark.slow
 def test_a_state_comes_back_from_the_disk_as_it_was(state):
     values, found = split(state)
     assert same(join(json.loads(json.dumps(values)), load(save(found))), state)

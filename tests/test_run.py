@@ -92,6 +92,7 @@ def test_transfers_copied_the_teacher_of_the_same_seed(seven):
                 assert same == (layer in report["frozen"]), (cell, layer)
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_and_another_seed_other_ones(seven, tmp_path):
     folder = folders(seven)["A0"]
     run("experiment=A0", f"output_dir={tmp_path}", *SHORT)
@@ -130,6 +131,7 @@ def test_a_directory_with_other_settings_is_refused(seven):
         summary.write_text(sealed)
 
 
+@pytest.mark.slow
 def test_a_teacher_by_path(seven, tmp_path):
     teacher = folders(seven)["H0"]
     for path in (teacher, teacher / "teacher.safetensors"):
@@ -155,6 +157,7 @@ def test_a_teacher_by_path(seven, tmp_path):
         (["output_dir=/dev/null/x"], "cannot be written"),
     ],
 )
+@pytest.mark.first_is_fast
 def test_what_cannot_be_run_says_so_in_one_line_and_creates_nothing(arguments, says, tmp_path):
     done = run("profile=quick", "tracking=off", *arguments, cwd=tmp_path, expect=2)
     assert says in done.stderr
@@ -162,6 +165,7 @@ def test_what_cannot_be_run_says_so_in_one_line_and_creates_nothing(arguments, s
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_any_gymnasium_environment(tmp_path, monkeypatch):
     # A graphics library that is missing matters to pictures only.
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
@@ -172,6 +176,7 @@ def test_any_gymnasium_environment(tmp_path, monkeypatch):
     assert load_teacher(student).description.dims.observation == 5
 
 
+@pytest.mark.slow
 def test_the_real_humanoid_and_its_armless_student(tmp_path):
     steps = ["total_timesteps=5050", "tracking=off", f"output_dir={tmp_path}"]
     run("env=humanoid", *steps)

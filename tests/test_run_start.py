@@ -34,6 +34,7 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
     return done.stderr.removeprefix("error: ").strip()
 
 
+@pytest.mark.slow
 def test_as_a_module_a_sweep_trains_and_says_how_to_go_on(tmp_path: Path) -> None:
     words = ["-m", "run", "-m", "seed=1,2", *TINY, "output_dir=runs"]
     done = python(tmp_path, *words, PYTHONPATH=str(ROOT))
@@ -55,6 +56,7 @@ def test_through_a_link(words: tuple[str, ...], tmp_path: Path) -> None:
 CELL = "import sys; sys.argv = {argv}; sys.path.insert(0, {root!r}); import run; code = run.main(); print(code)"
 
 
+@pytest.mark.slow
 def test_in_a_notebook(tmp_path: Path) -> None:
     for words in (["-f", "/root/kernel-1.json"], ["--f=/root/kernel-1.json"]):
         argv = ["ipykernel_launcher.py", *words]
@@ -84,6 +86,7 @@ def test_in_a_notebook(tmp_path: Path) -> None:
         (["seed=1", "-m", "env=ant"], "env=ant: stands behind an option; options such as -m go before all settings"),
     ],
 )
+@pytest.mark.first_is_fast
 def test_what_cannot_be_started_is_one_line(words: list[str], says: str, tmp_path: Path) -> None:
     assert says in one_line(python(tmp_path, str(ROOT / "run.py"), *words))
     assert list(tmp_path.iterdir()) == []
@@ -134,6 +137,7 @@ else:
         ("torch", ("acmr.evaluation", "results/paper/humanoid-none/seed_1")),
     ],
 )
+@pytest.mark.first_is_fast
 def test_ctrl_c_at_once_is_one_line(module: str, words: tuple[str, ...], tmp_path: Path) -> None:
     more = [f"output_dir={tmp_path}"] if words[0] == "run.py" else []
     done = python(ROOT, "-c", INTERRUPTED, module, *words, *more)

@@ -65,6 +65,7 @@ def test_the_state_of_the_fast_learner_is_refused():
         make_plain(fresh()).load_state_dict(SAC(fresh(), CONFIG, generator(1), generator(2)).state_dict())
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_ends_as_one_that_is_not(untouched, tmp_path):
     run = Run(tmp_path, PLAIN)
     assert run(at_step(150)).code == -signal.SIGKILL

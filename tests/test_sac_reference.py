@@ -113,6 +113,7 @@ def compared(fast: SAC, plain: PlainSAC) -> dict[str, tuple[torch.Tensor, torch.
 
 
 @pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.first_is_fast
 def test_every_cell_takes_the_same_course(cell, teacher_factory):
     config = SACConfig(hidden_sizes=[64, 48], batch_size=96)
     assert_same_course(lambda: make_networks(cell, (64, 48), teacher_factory), config)
@@ -155,6 +156,7 @@ def test_the_code_path_of_a_gpu_takes_the_same_course(cell, teacher_factory, mon
 
 @pytest.mark.usefixtures("_double")
 @pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.first_is_fast
 def test_every_cell_to_the_precision_of_float64(cell, teacher_factory):
     config = SACConfig(hidden_sizes=[64, 48], batch_size=96)
     assert_same_course(lambda: make_networks(cell, (64, 48), teacher_factory), config)

@@ -80,6 +80,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page, Analy
     return root, Page(path.read_text(encoding="utf-8")), analysis
 
 
+@pytest.mark.slow
 def test_every_link_of_the_report_leads_to_what_it_names(results):
     root, page, _ = results
     links = [attributes["href"] or "" for tag, attributes in page.elements if tag == "a"]

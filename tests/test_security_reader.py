@@ -176,6 +176,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.first_is_fast
 def test_whatever_lies_in_the_place_of_a_file_costs_a_line(shape, run, original, monkeypatch, capsys):
     monkeypatch.chdir(run)
     for name in FILES:
@@ -207,6 +208,7 @@ WHO = {
 
 @pytest.mark.parametrize("count", [30, pytest.param(500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", WHO)
+@pytest.mark.first_is_fast
 def test_values_of_other_types_cost_a_line(name, count, run, capsys):
     signal.alarm(600)
     rng = random.Random(name)
@@ -230,6 +232,7 @@ def test_values_of_other_types_cost_a_line(name, count, run, capsys):
 
 @pytest.mark.parametrize("name", ["episodes.csv", "metrics.csv"])
 @pytest.mark.parametrize("cell", ["", "x", "nan", "inf", "-1", "1e400", "2.5", '"', "=1", "\x00", "9" * 400, "1,2"])
+@pytest.mark.first_is_fast
 def test_cells_of_other_types_cost_a_line(name, cell, run):
     lines = (run / name).read_text().splitlines()
     for line in (0, 1):

@@ -69,6 +69,7 @@ def run(folder: Path, *words: str, **more: str) -> subprocess.CompletedProcess[s
 
 
 @pytest.mark.parametrize("way", WAYS)
+@pytest.mark.first_is_fast
 def test_a_sweep_finds_them_and_plans_their_teachers(way: str, own: Path) -> None:
     done = run(own.parent, *shlex.split(way.format(own=own)), "matrix=mine", "plan=true")
     assert done.returncode == 0, done.stderr
@@ -78,6 +79,7 @@ def test_a_sweep_finds_them_and_plans_their_teachers(way: str, own: Path) -> Non
 
 
 @pytest.mark.parametrize("way", [WAYS[0], WAYS[3]])
+@pytest.mark.first_is_fast
 def test_a_single_run_finds_them_and_prints_a_command_that_does(way: str, own: Path) -> None:
     done = run(own.parent, *shlex.split(way.format(own=own)), *SINGLE)
     assert done.returncode == 2
@@ -97,6 +99,7 @@ def test_a_package_of_settings_is_found_by_its_name(own: Path) -> None:
     assert f"stage 2    runs/{STUDENT}" in done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_a_whole_folder_in_the_place_of_conf(own: Path) -> None:
     whole = own.parent / "whole"
     shutil.copytree(ROOT / "conf", whole)
@@ -109,6 +112,7 @@ def test_a_whole_folder_in_the_place_of_conf(own: Path) -> None:
     assert f"python run.py --config-path {whole} --config-name study profile=mine env=my_source" in refused.stderr
 
 
+@pytest.mark.slow
 def test_a_sweep_trains_what_it_has_planned_whatever_becomes_of_the_files(own: Path) -> None:
     done = run(own.parent, "--config-dir", "own", "matrix=mine")
     assert done.returncode == 0, done.stdout + done.stderr

@@ -46,6 +46,7 @@ def test_the_first_actions_are_the_policys(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("step", [40, 150])
+@pytest.mark.first_is_fast
 def test_a_killed_run_goes_on_bit_for_bit(step: int, tmp_path: Path) -> None:
     words = (*ANT, "agent.start=policy")
     whole, killed = Run(tmp_path / "whole", words), Run(tmp_path / "killed", words)

@@ -183,6 +183,7 @@ OVERRIDES = st.fixed_dictionaries(
 
 @settings(max_examples=12, deadline=None)
 @given(OVERRIDES)
+@pytest.mark.slow
 def test_composing_from_copies_gives_what_hydra_gives(values):
     # Some values bring their own words.
     words = [word for key, value in values.items() for word in (f"{value}" if "=" in f"{value}" else f"{key}={value}",)]

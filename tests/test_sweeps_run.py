@@ -133,6 +133,7 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "runs"
 
 
+@pytest.mark.slow
 def test_students_bring_their_teacher_and_a_second_time_nothing_is_left_to_do(out):
     words = ["-m", "transfer=hidden,expand", "agent.hidden_sizes=[16,16]", *TINY]
     first = run(out, *words)
@@ -169,6 +170,7 @@ def test_a_plan_starts_nothing(out):
         (["matrix=quick", "workers=0"], "workers=0: an integer"),
     ],
 )
+@pytest.mark.first_is_fast
 def test_a_wrong_word_is_refused_in_one_line_before_anything_starts(out, words, says):
     told = run(out, *words)
     assert told.returncode == 2
@@ -179,6 +181,7 @@ def test_a_wrong_word_is_refused_in_one_line_before_anything_starts(out, words, 
 
 
 @pytest.mark.parametrize("retries", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_run_that_raises_exits_or_is_killed_takes_no_other_with_it(out, tmp_path, retries):
     (tmp_path / "broken.py").write_text(BROKEN_ENVIRONMENTS)
     ids = ",".join(f"broken:{name}-v0" for name in ("Raise", "Exit", "Kill", "None"))
@@ -200,6 +203,7 @@ def test_a_run_that_raises_exits_or_is_killed_takes_no_other_with_it(out, tmp_pa
     assert sorted(state["failures"] for state in states) == [0] + [retries + 1] * 3
 
 
+@pytest.mark.slow
 def test_a_second_sweep_on_the_same_runs_is_refused(out):
     sweep = start(out, "-m", "seed=1,2", *TINY)
     try:

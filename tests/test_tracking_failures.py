@@ -29,6 +29,7 @@ def test_a_folder_whose_name_is_no_text_costs_one_line(tmp_path: Path) -> None:
     assert line.startswith("WARNING W&B mirror not started: UnicodeEncodeError")
 
 
+@pytest.mark.slow
 def test_kill_9_costs_the_last_second_at_most(tmp_path: Path) -> None:
     program = """
         tracker = start()
@@ -116,6 +117,7 @@ FAILURES = {
 
 
 @pytest.mark.parametrize("failure", FAILURES)
+@pytest.mark.first_is_fast
 def test_a_failure_costs_one_warning_and_never_the_run(tmp_path: Path, failure: str) -> None:
     later, before, warning = FAILURES[failure]
     program = f"""
@@ -141,6 +143,7 @@ def test_a_failure_costs_one_warning_and_never_the_run(tmp_path: Path, failure: 
     assert trained == "trained"
 
 
+@pytest.mark.slow
 def test_rows_that_stop_arriving_are_noticed_during_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wandb_tracker, "ARRIVAL_CHECK", 1.2)
     warnings: list[str] = []

@@ -5,9 +5,11 @@ import json
 from itertools import accumulate
 from pathlib import Path
 
+import pytest
 from guides import ROOT, copy_checkout, follow
 
 
+@pytest.mark.slow
 def test_the_tracker_of_the_guide_works(tmp_path: Path) -> None:
     checkout = copy_checkout(tmp_path / "checkout")
     said = follow(ROOT / "docs" / "howto-tracking.md", checkout)

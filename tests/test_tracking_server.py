@@ -138,6 +138,7 @@ def closed_port() -> str:
         return f"http://127.0.0.1:{probe.getsockname()[1]}"
 
 
+@pytest.mark.slow
 def test_sync_sends_every_row_once(
     tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -171,6 +172,7 @@ def test_sync_sends_every_row_once(
     assert list(elsewhere.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_server_is_mirrored_to_at_once(tmp_path: Path, server: Server) -> None:
     warnings: list[str] = []
     tracker = start(tmp_path, warnings, server.url)
@@ -187,6 +189,7 @@ def test_a_server_is_mirrored_to_at_once(tmp_path: Path, server: Server) -> None
 
 
 @pytest.mark.parametrize("failure", ["no server", "no answer", "no address", "no key", "key refused", "server broken"])
+@pytest.mark.first_is_fast
 def test_no_server_means_offline_with_one_warning(
     tmp_path: Path, failure: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,6 +230,7 @@ def test_no_server_means_offline_with_one_warning(
     late.stop()
 
 
+@pytest.mark.slow
 def test_a_server_that_goes_away_delays_nothing_and_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -67,6 +67,7 @@ def test_a_killed_run_loses_no_event_and_a_resumed_one_has_none_twice(tmp_path: 
     assert not (run.folder / "tensorboard").exists()
 
 
+@pytest.mark.slow
 def test_events_are_rebuilt_from_the_runs_own_files(tmp_path: Path) -> None:
     run = Run(tmp_path, ANT)
     assert run().code == 0

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import queue
 import threading
 import time
+import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
@@ -18,7 +20,7 @@ MOST_ROWS = 10_000
 PATIENCE = 30.0
 #: Seconds that the observer may take to start and to close before it is given up.
 START_WAIT, CLOSE_WAIT = 120.0, 45.0
-#: Seconds that the thread has to end once what it waits for has been ended.
+#: Seconds that the thread has to end once what it waits for has been ended, and for rows that wait where nobody closes.
 _LAST_WAIT = 3.0
 
 
@@ -59,6 +61,9 @@ class Threaded(Observer):
             self._give_up()
             raise TimeoutError(f"it has not started within {START_WAIT:g} s")
         self._raise()
+        # A program that ends without a close still hands over its rows, before W&B's own last words (registered later,
+        # called earlier).
+        atexit.register(_hand_over, weakref.ref(self))
 
     def on_episode(self, record: EpisodeRecord) -> None:
         """Passes it on."""
@@ -83,6 +88,15 @@ class Threaded(Observer):
                 raise TimeoutError(f"it did not end within {self._close_wait:g} s, and was ended")
             return
         self._raise()
+
+    def hand_over(self) -> None:
+        """Waits a moment for what was told to be through; nothing is raised."""
+        through = threading.Event()
+        with suppress(queue.Full):
+            self._waiting.put_nowait((lambda observer: through.set(), False))
+        deadline = time.monotonic() + _LAST_WAIT
+        while self._thread.is_alive() and not through.is_set() and time.monotonic() < deadline:
+            through.wait(0.02)
 
     def _tell(self, what: Callable[[Observer], None]) -> None:
         self._raise()
@@ -129,3 +143,9 @@ class Threaded(Observer):
             except BaseException as error:
                 self._error, failed = error, True
             self._busy_since = None
+
+
+def _hand_over(reference: weakref.ref[Threaded]) -> None:
+    threaded = reference()
+    if threaded is not None:
+        threaded.hand_over()
