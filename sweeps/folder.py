@@ -289,7 +289,7 @@ def _entry(path: Path, index: int, run: Any) -> SweepRun:
 @contextmanager
 def _locked(path: Path) -> Iterator[bool]:
     """Whether a file's lock could be had; the lock goes with the process that has it, however that ends."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o644)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW, 0o644)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield True

@@ -19,11 +19,12 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from acmr.config import ConfigError, ExperimentConfig
+from acmr.foreign import opened
 from acmr.records import DamagedError
 from acmr.settings.compose import look_in
 from acmr.settings.run_spec import RunSpec
 from acmr.settings.sources import stored_sources
-from acmr.storage.durable import read_regular
+from acmr.storage.durable import open_to_append, read_regular
 from acmr.storage.json_files import write_json
 from acmr.text import one_line
 from sweeps.folder import SweepFolder
@@ -90,13 +91,16 @@ class TrainingProcess:
         job_file: The run's settings.
         log_file: Takes what the process prints, at its end.
         threads: Threads that it may use.
+
+    Raises:
+        OSError: If it cannot be started, or its output cannot be kept.
     """
 
     def __init__(self, job_file: Path, log_file: Path, threads: int) -> None:
         log_file.parent.mkdir(parents=True, exist_ok=True)
-        self._log_file, self._start = log_file, log_file.stat().st_size if log_file.exists() else 0
         variables = {f"{library}_NUM_THREADS": str(threads) for library in ("OMP", "MKL", "OPENBLAS")}
-        with log_file.open("ab") as log:
+        with open(open_to_append(log_file), "ab") as log:
+            self._log_file, self._start = log_file, log.tell()
             self._process = _start([sys.executable, str(REPOSITORY / "run.py"), f"@{job_file}"], variables, log)
 
     def wait(self, seconds: float = _POLL) -> int | None:
@@ -117,9 +121,14 @@ class TrainingProcess:
 
     def last_words(self) -> str:
         """The line that says why it ended, if it printed one."""
-        with self._log_file.open("rb") as stream:
-            stream.seek(max(self._start, self._log_file.stat().st_size - 20_000))
-            lines = [line for line in stream.read().decode(errors="replace").splitlines() if line.strip()]
+        try:
+            with opened(self._log_file, links=False) as (stream, size):
+                stream.seek(max(self._start, size - 20_000))
+                said = stream.read().decode(errors="replace")
+        except DamagedError:
+            # Whoever took it away meanwhile has what stood in it.
+            return ""
+        lines = [line for line in said.splitlines() if line.strip()]
         return _error_line(lines)
 
 

@@ -143,7 +143,10 @@ class Worker:
 
     def _attempt(self, entry: SweepRun) -> tuple[int, str]:
         run_dir = self._folder.output_dir / entry.directory
-        training = TrainingProcess(self._folder.job_file(entry.index), run_dir / OUTPUT_FILE, entry.threads)
+        try:
+            training = TrainingProcess(self._folder.job_file(entry.index), run_dir / OUTPUT_FILE, entry.threads)
+        except OSError as error:
+            return REFUSED, f"{error.filename or run_dir}: {error.strerror or error}"
         try:
             while (code := training.wait()) is None and not self._is_over():
                 pass

@@ -4,7 +4,9 @@ import hashlib
 import json
 import os
 import resource
+import shutil
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -236,3 +238,26 @@ def test_links_in_a_run_directory_lead_nowhere(name, stopped, tmp_path):
     assert ended.code == (0 if name == "status.json" else 2), ended.said
     assert "Traceback" not in ended.said
     assert [path.read_bytes() for path in files] == before
+
+
+@pytest.mark.parametrize("name", ["checkpoint", "episodes.csv", "metrics.csv", "run.log", ".lock", "status.json"])
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_pipes_and_folders_in_a_run_directory_are_not_waited_for(name, make, stopped):
+    place = stopped.folder / name
+    if place.is_dir():
+        shutil.rmtree(place)
+    place.unlink(missing_ok=True)
+    make(place)
+    if make is os.mkdir:
+        (place / "theirs").touch()
+    child = stopped.start()
+    deadline = time.monotonic() + 60
+    once = os.WEXITED | os.WNOWAIT | os.WNOHANG
+    while not (done := os.waitid(os.P_PID, child, once)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    if not done:
+        os.kill(child, signal.SIGKILL)
+    ended = stopped.wait(child)
+    # A run without a checkpoint begins anew, a status is written in the place of what is none.
+    assert ended.code in ((0, 2, 74) if name in ("checkpoint", "status.json") else (2, 74)), ended.said
+    assert "Traceback" not in ended.said

@@ -149,6 +149,26 @@ def test_settings_of_a_run_that_cannot_be_read_are_said_in_one_line(damage, tmp_
     folder.release()
 
 
+@pytest.mark.parametrize("kind", ["a pipe", "a folder", "a link out", "a link nowhere"])
+def test_output_that_cannot_be_kept_fails_its_run_in_one_line(kind, tmp_path):
+    folder = sweep(tmp_path, entry(0))
+    output = tmp_path / folder.entries()[0].directory / "output.log"
+    output.parent.mkdir(parents=True, exist_ok=True)
+    outside = tmp_path / "outside"
+    outside.write_text("theirs")
+    {
+        "a pipe": os.mkfifo,
+        "a folder": Path.mkdir,
+        "a link out": lambda path: path.symlink_to(outside),
+        "a link nowhere": lambda path: path.symlink_to(tmp_path / "gone"),
+    }[kind](output)
+    Worker(folder, 0).take(0)
+    assert folder.state(0) == State("failed", 1, f"{output}: no regular file")
+    assert outside.read_text() == "theirs"
+    assert not (tmp_path / "gone").exists()
+    folder.release()
+
+
 def test_new_sweeps_are_made_beside_damaged_ones(tmp_path):
     for damage in list(PLANS)[:6]:
         folder = sweep(tmp_path, entry(0))

@@ -12,6 +12,7 @@ import errno
 import hashlib
 import os
 import re
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ from acmr.storage.hold import check_hold
 hook: Callable[[str, Path], None] | None = None
 
 _CREATE = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+#: Not to wait for the reader of a pipe.
+_APPEND = _CREATE | os.O_APPEND | os.O_NONBLOCK
 _TEMPORARY = re.compile(r"\..*\.tmp")
 
 #: What to do about an error of the disk.
@@ -153,6 +156,28 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
+def open_to_append(path: Path) -> int:
+    """Opens a file that grows, and makes it where there is none; its descriptor.
+
+    Raises:
+        OSError: If that cannot be done, or something else than a regular file has its name, a link or a pipe.
+    """
+    with suppress(FileNotFoundError):
+        _check_regular(os.lstat(path), path)
+    descriptor = os.open(path, _APPEND, 0o644)
+    try:
+        _check_regular(os.fstat(descriptor), path)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _check_regular(status: os.stat_result, path: Path) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "no regular file", str(path))
+
+
 class Appender:
     """A file that only grows.
 
@@ -169,7 +194,7 @@ class Appender:
         self._path = path
         held = b"" if digest is None else read_checked(path, digest)
         with _step("open", path):
-            self._descriptor = os.open(path, _CREATE | os.O_APPEND, 0o644)
+            self._descriptor = open_to_append(path)
             os.ftruncate(self._descriptor, len(held))
         self._hash, self._bytes = hashlib.sha256(held), len(held)
 

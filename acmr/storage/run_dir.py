@@ -38,6 +38,7 @@ from acmr.run_folders import changes, sealed
 from acmr.storage.durable import (
     FileDigest,
     StorageError,
+    open_to_append,
     read_regular,
     remove,
     remove_leftovers,
@@ -178,7 +179,10 @@ class RunDir:
             with suppress(OSError, ValueError):
                 say(line)
 
-        descriptor = self._open(self.log_file, os.O_WRONLY | os.O_APPEND)
+        try:
+            descriptor = open_to_append(self.log_file)
+        except OSError as error:
+            raise self._refused(error) from error
         try:
             yield both
         except Exception as error:
@@ -215,15 +219,10 @@ class RunDir:
             with suppress(OSError, LostError):
                 replace_json(path, status | {"state": state, "cause": cause})
 
-    def _open(self, path: Path, flags: int) -> int:
-        try:
-            return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
-        except OSError as error:
-            raise self._refused(error) from error
-
     def _refused(self, error: OSError) -> ConfigError:
+        place = error.filename or self.path
         return ConfigError(
-            f"{self.path}: cannot be written ({error.strerror}); free or unlock it, or type output_dir=FOLDER"
+            f"{place}: cannot be written ({error.strerror}); free or unlock it, or type output_dir=FOLDER"
         )
 
 
