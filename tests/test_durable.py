@@ -17,6 +17,7 @@ from acmr.storage.durable import (
     make_folder,
     read_checked,
     read_regular,
+    remove_tree,
     write_bytes,
 )
 
@@ -172,3 +173,19 @@ def test_no_link_is_followed_and_nothing_else_is_read(tmp_path):
     with pytest.raises(WriteError, match="it is a link"):
         make_folder(inside / "folder")
     assert stat.S_ISLNK((inside / "folder").lstat().st_mode)
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe", "link", "file", "nothing"])
+def test_whatever_has_a_name_is_removed_and_nothing_beyond_it(kind, tmp_path):
+    outside, place = tmp_path / "outside", tmp_path / "place"
+    outside.mkdir()
+    (outside / "theirs").touch()
+    if kind == "folder":
+        (place / "inner").mkdir(parents=True)
+        (place / "link").symlink_to(outside)
+        os.mkfifo(place / "inner" / "pipe")
+    else:
+        {"pipe": os.mkfifo, "link": lambda path: path.symlink_to(outside), "file": Path.touch}.get(kind, str)(place)
+    remove_tree(place)
+    assert not os.path.lexists(place)
+    assert (outside / "theirs").exists()

@@ -240,13 +240,19 @@ def test_links_in_a_run_directory_lead_nowhere(name, stopped, tmp_path):
     assert [path.read_bytes() for path in files] == before
 
 
-@pytest.mark.parametrize("name", ["checkpoint", "episodes.csv", "metrics.csv", "run.log", ".lock", "status.json"])
+_NAMES = ("checkpoint", "tensorboard", "episodes.csv", "metrics.csv", "run.log", ".lock", "status.json")
+
+
+@pytest.mark.parametrize("name", _NAMES)
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
 def test_pipes_and_folders_in_a_run_directory_are_not_waited_for(name, make, stopped):
     place = stopped.folder / name
     if place.is_dir():
         shutil.rmtree(place)
     place.unlink(missing_ok=True)
+    if name == "tensorboard":
+        # It is removed where the run begins anew.
+        shutil.rmtree(stopped.folder / "checkpoint")
     make(place)
     if make is os.mkdir:
         (place / "theirs").touch()
@@ -259,5 +265,5 @@ def test_pipes_and_folders_in_a_run_directory_are_not_waited_for(name, make, sto
         os.kill(child, signal.SIGKILL)
     ended = stopped.wait(child)
     # A run without a checkpoint begins anew, a status is written in the place of what is none.
-    assert ended.code in ((0, 2, 74) if name in ("checkpoint", "status.json") else (2, 74)), ended.said
+    assert ended.code in ((0, 2, 74) if name in ("checkpoint", "tensorboard", "status.json") else (2, 74)), ended.said
     assert "Traceback" not in ended.said

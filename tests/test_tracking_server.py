@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import gzip
 import json
+import os
 import socket
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ from typing import Any
 import pytest
 from tracking_tools import ID, RUN, spec
 
+from acmr.config import ConfigError
 from acmr.records import EpisodeRecord
 from acmr.tracking import wandb_backend
-from acmr.tracking.mirror import main, unsent
+from acmr.tracking.mirror import main, sync, unsent
 from acmr.tracking.observer import Observer
 from acmr.tracking.watchers import make_tracker
 
@@ -268,3 +270,13 @@ def test_sync_that_cannot_be_done_says_why_in_one_line(
     for line, words in zip(lines, said, strict=True):
         assert line.startswith("error: ")
         assert words in line
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/etc/hostname")], ids=["pipe", "link"])
+def test_sync_sends_nothing_that_lies_elsewhere(make: Callable[[Path], None], tmp_path: Path, server: Server) -> None:
+    mirror = tmp_path / "wandb" / "offline-run-20261126_113255-sent"
+    (mirror / "files").mkdir(parents=True)
+    (mirror / "run-sent.wandb").write_bytes(b":W&B")
+    make(mirror / "files" / "notes.txt")
+    with pytest.raises(ConfigError, match=r"files/notes\.txt: no regular file; W&B would send what it leads to"):
+        sync(tmp_path / "wandb", server.url)

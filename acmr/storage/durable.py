@@ -12,6 +12,7 @@ import errno
 import hashlib
 import os
 import re
+import shutil
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -137,6 +138,20 @@ def remove(path: Path) -> None:
     """Removes a file if there is one."""
     with _step("remove", path):
         path.unlink(missing_ok=True)
+
+
+def remove_tree(path: Path) -> None:
+    """Removes whatever has a name: a folder with all that is in it, but of a link or a pipe itself only.
+
+    Raises:
+        OSError: If that cannot be done; where there is nothing, nothing is.
+    """
+    with suppress(FileNotFoundError):
+        # What is no folder is not even opened by that function: it would wait for the writer of a pipe.
+        if stat.S_ISDIR(os.lstat(path).st_mode):
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -42,6 +41,7 @@ from acmr.storage.durable import (
     read_regular,
     remove,
     remove_leftovers,
+    remove_tree,
     sync_folder,
     write_bytes,
 )
@@ -124,7 +124,8 @@ class RunDir:
         for name in _RESULTS:
             remove(self.path / name)
         # Whether or not this run is shown there, the old one must not be.
-        shutil.rmtree(self.path / EVENTS_FOLDER, ignore_errors=True)
+        with suppress(OSError):
+            remove_tree(self.path / EVENTS_FOLDER)
         # Nothing of the old run may come back once the new one has begun.
         sync_folder(self.path)
         write_bytes(self.config_file, yaml.safe_dump(dict(settings), sort_keys=False).encode())

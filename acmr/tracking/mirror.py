@@ -85,6 +85,9 @@ def sync(folder: Path, base_url: str) -> int:
     files = unsent(folder)
     if not files:
         return 0
+    sent = (path for file in files for path in (file, file.parent / "files", *file.parent.glob("files/**/*")))
+    if odd := next((path for path in sent if is_there(path) and not _is_plain(path)), None):
+        raise ConfigError(f"{odd}: no regular file; W&B would send what it leads to. Move {odd.parent} away")
     if problem := server_problem(base_url):
         raise ConfigError(f"{len(files)} runs wait in {folder}, but {problem}")
     foreign = {key: value for key, value in os.environ.items() if not key.startswith("WANDB_")}
@@ -173,6 +176,10 @@ def _summary(run_dir: Path) -> dict[str, Any] | None:
 def _is_sent(file: Path) -> bool:
     marker = file.with_suffix(".wandb.synced")
     return marker.exists() and marker.stat().st_mtime >= file.stat().st_mtime
+
+
+def _is_plain(path: Path) -> bool:
+    return not path.is_symlink() and (path.is_file() or path.is_dir())
 
 
 def _log_folder(folder: Path) -> str:

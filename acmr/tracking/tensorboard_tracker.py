@@ -6,13 +6,14 @@ They are no result and can always be written anew from the run's own files (:mod
 from __future__ import annotations
 
 import platform
-import shutil
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from acmr.records import EVENTS_FOLDER, EpisodeRecord
 from acmr.settings.run_spec import RunSpec
+from acmr.storage.durable import remove_tree
 from acmr.tracking.observer import Say, Tracker
 
 
@@ -42,7 +43,8 @@ class TensorBoardTracker(Tracker):
             raise ModuleNotFoundError("it is not installed; type pip install tensorboard") from error
         self._event, self._summary = Event, Summary
         folder = spec.directory / EVENTS_FOLDER
-        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):
+            remove_tree(folder)
         folder.mkdir()
         # TensorBoard finds files by the beginning of this name, and orders those of one run by the number in it.
         file = folder / f"events.out.tfevents.{time.time():.0f}.{platform.node()}"

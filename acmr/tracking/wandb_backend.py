@@ -10,7 +10,6 @@ import hashlib
 import logging
 import os
 import re
-import shutil
 import signal
 import sys
 import threading
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acmr.settings.run_spec import RunSpec
+from acmr.storage.durable import remove_tree
 from acmr.text import one_line
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def mirrors_of(folder: Path, name: str) -> list[Path]:
 def remove_mirrors(folder: Path, name: str) -> None:
     """Removes earlier mirrors of a run, so that no viewer shows it twice."""
     for path in mirrors_of(folder, name):
-        shutil.rmtree(path)
+        remove_tree(path)
     _drop_dead_links(folder)
 
 
