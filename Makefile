@@ -5,11 +5,11 @@ PYTHON ?= python3
 PROFILE ?= paper
 RUNS ?= runs
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(abspath $(VENV))/bin
 READY := $(VENV)/.ready
 # One thread a process: runs and tests share the cores by being several processes.
 export OMP_NUM_THREADS ?= 1
-export PATH := $(CURDIR)/$(BIN):$(PATH)
+export PATH := $(BIN):$(PATH)
 
 
 .PHONY: help setup test test-slow torture mutations lint format demo paper status paper-figures report publish dashboard sync bench bench-check profile clean
@@ -17,12 +17,14 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 help: ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
 
-setup: $(READY) ## make .venv with the exact versions of constraints.txt
+setup: $(READY) ## make .venv, or VENV=FOLDER, with the exact versions of constraints.txt
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if v >= (3, 11) else \
 		f"Python {v[0]}.{v[1]} given, 3.11 or newer needed: make $(MAKECMDGOALS) PYTHON=python3.11")'
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@# One that uv made has no pip.
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip >/dev/null
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 

@@ -1,6 +1,7 @@
 """What every command of the project begins with: nothing that it prints can end it, and Ctrl-C ends it in one line.
 
-So does what the system refuses: a name that is too long, a folder that is gone or locked, a disk that is full.
+So does what the system refuses: a name that is too long, a folder that is gone or locked, a disk that is full. And
+how the commands are called in the lines that they print.
 
 The standard library only, so that it is there before anything that takes long to load.
 """
@@ -15,6 +16,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
+from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec
 
 from acmr.names import terminal
@@ -28,6 +30,43 @@ _Arguments = ParamSpec("_Arguments")
 INTERRUPTED = 130
 #: The exit code of what cannot be done.
 REFUSED = 2
+#: The command of an installed program; its words for what is a module or a file of a checkout.
+PROGRAM = "acmr"
+SUBCOMMANDS = {
+    "train": "run.py",
+    "status": "sweeps.status",
+    "analyze": "analysis",
+    "publish": "analysis.publish",
+    "evaluate": "acmr.evaluation",
+    "envs": "acmr.envs",
+    "mirror": "acmr.tracking.mirror",
+}
+#: Who was started as ``acmr`` is told ``acmr`` words; so are its workers, and whoever has no ``run.py``.
+_STARTED_AS = "ACMR_STARTED_AS"
+if Path(sys.argv[0] if getattr(sys, "argv", None) else "").stem == PROGRAM:
+    os.environ[_STARTED_AS] = PROGRAM
+
+
+def typed(subcommand: str = "train") -> str:
+    """What to type for a subcommand: ``python run.py`` or ``acmr``, ``python -m acmr.envs`` or ``acmr envs``.
+
+    Args:
+        subcommand: A key of :data:`SUBCOMMANDS`.
+    """
+    module = SUBCOMMANDS[subcommand]
+    in_checkout = (Path(__file__).resolve().parents[1] / SUBCOMMANDS["train"]).is_file()
+    if in_checkout and os.environ.get(_STARTED_AS) != PROGRAM:
+        return f"python {module}" if subcommand == "train" else f"python -m {module}"
+    return PROGRAM if subcommand == "train" else f"{PROGRAM} {subcommand}"
+
+
+def add_own_modules() -> None:
+    """Lets settings name modules of the user's own that lie in the current folder (``env.id=my_robots:Cart-v0``).
+
+    Behind all others: a folder of the user's that is called ``analysis`` is not to be taken for ours.
+    """
+    if "" not in sys.path and (here := os.getcwd()) not in sys.path:
+        sys.path.append(here)
 
 
 def command(main: Callable[_Arguments, int]) -> Callable[_Arguments, int]:

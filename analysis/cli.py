@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import NoReturn
 
 from acmr.cells import REFERENCE
-from acmr.command import command
+from acmr.command import command, typed
 from acmr.names import terminal
 from analysis import FORMATS
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        self.exit(2, terminal(f"analysis: {message} (python -m analysis --help)") + "\n")
+        self.exit(2, terminal(f"analysis: {message} ({typed('analyze')} --help)") + "\n")
 
 
 @command
@@ -46,9 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
-        prog="python -m analysis",
+        prog=typed("analyze"),
         description="Makes the paper's tables and figures, and a report, from run directories.",
-        epilog="example: python -m analysis runs/paper --out results/paper",
+        epilog=f"example: {typed('analyze')} runs/paper --out results/paper",
     )
     parser.add_argument("runs", type=Path, metavar="RUNS", help="folder of the runs, as in runs/paper")
     parser.add_argument(

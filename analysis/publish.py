@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from acmr.cells import CELLS
-from acmr.command import command
+from acmr.command import command, typed
 from acmr.config import THRESHOLD
 from acmr.foreign import is_there, read_bytes, read_mapping
 from acmr.names import terminal
@@ -218,7 +218,7 @@ def _check_size(out: Path, runs: Path, more: int) -> None:
     if total > MOST:
         raise PublishError(
             f"{os.path.relpath(whole)}: would hold {size(total)} of runs, and {size(MOST)} are the most that a clone "
-            f"should carry; publish fewer of them, as in python -m analysis.publish {runs}/NAME {out}/NAME"
+            f"should carry; publish fewer of them, as in {typed('publish')} {runs}/NAME {out}/NAME"
         )
 
 
@@ -268,7 +268,7 @@ def _report(done: Published) -> Iterator[str]:
 @command
 def main() -> int:
     """Entry of ``python -m analysis.publish``."""
-    parser = argparse.ArgumentParser(prog="python -m analysis.publish", description="Finished runs, to be committed.")
+    parser = argparse.ArgumentParser(prog=typed("publish"), description="Finished runs, to be committed.")
     parser.add_argument("runs", type=Path, help="folder of runs, as runs/paper")
     parser.add_argument("out", type=Path, help="where they are added, as results/paper")
     parser.add_argument("--trust", action="store_true", help="run code that the runs' own files name, to evaluate them")

@@ -13,12 +13,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "docs" / "images" / "rooms.svg"
-PACKAGES = ("acmr", "analysis", "sweeps")
+PACKAGES = ("acmr", "analysis", "sweeps", "acmr_app")
 #: Modules of the ground are one room: everything may import them.
 GROUND = "acmr"
 
 _WIDTH, _TITLE, _LINE, _GAP, _ROW_GAP = 168, 22, 13, 16, 16
-_COLORS = {"acmr": "#e8f1fa", "analysis": "#eef6e9", "sweeps": "#fbf0e2"}
+_COLORS = {"acmr": "#e8f1fa", "analysis": "#eef6e9", "sweeps": "#fbf0e2", "acmr_app": "#f3ecf7"}
 
 
 def read_rule(package: str) -> list[list[set[str]]]:
@@ -77,12 +77,14 @@ def imported_rooms() -> dict[str, list[str]]:
     direct: dict[str, set[str]] = {}
     for module, path in modules().items():
         others = {room_of(name) for name in imports(path) if name in modules()}
+        # What the ground passes on to users of the package belongs to the room that it comes from.
+        others -= {"acmr_app"} if room_of(module) == GROUND else set()
         direct.setdefault(room_of(module), set()).update(others - {room_of(module), GROUND, "analysis"})
     return {room: sorted(others) for room, others in direct.items()}
 
 
 def rows() -> list[list[str]]:
-    """Rooms by row, lowest first: those of ``acmr`` by its rule, ``sweeps`` above them, ``analysis`` beside them."""
+    """Rooms by row, lowest first: ``acmr`` by its rule, ``analysis`` beside, ``sweeps`` and ``acmr_app`` above."""
     names = rooms()
     acmr = [[f"acmr.{part}" for group in level for part in sorted(group)] for level in read_rule("acmr")]
     table = [[room for room in level if room in names] for level in acmr[1:]]
@@ -90,7 +92,7 @@ def rows() -> list[list[str]]:
     beside = [[f"analysis.{part}" for group in level for part in sorted(group)] for level in read_rule("analysis")]
     for index, level in enumerate(beside):
         table[min(index + 1, len(table) - 1)] += [room for room in level if room in names]
-    return table
+    return [*table, [room for room in names if room.startswith("acmr_app")]]
 
 
 def draw() -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
+from acmr.command import PROGRAM
 from acmr.names import terminal
 from acmr.records import COMPLETE, DIVERGED, ENDED, FAILED, RUNNING, STOPPED
 from acmr.text import duration, size
@@ -170,6 +172,14 @@ def print_plan(plan: Plan, needs: Estimate, workers: int, output_dir: Path) -> N
         console.print(f"stop: the time counts on runs that meet their threshold {guide}", soft_wrap=True)
     console.print(f"memory: {_bytes(needs.memory)} at most, once the replay memories are full", soft_wrap=True)
     console.print(f"disk: {_bytes(needs.disk)} at most; {_bytes(needs.kept)} stay", soft_wrap=True)
+
+
+def command_line() -> str:
+    """The command line as it was typed, not as Hydra got it; in a notebook Python's own is that of the kernel."""
+    if Path(sys.argv[0]).stem == PROGRAM:
+        own = next(place for place, word in enumerate(sys.orig_argv) if Path(word).stem == PROGRAM)
+        return shlex.join([PROGRAM, *sys.orig_argv[own + 1 :]])
+    return shlex.join(["python", *(["run.py", *sys.argv[1:]] if "ipykernel" in sys.modules else sys.orig_argv[1:])])
 
 
 def _sentence(view: RunStatus, detail: str) -> str:

@@ -29,7 +29,11 @@ from acmr.storage.json_files import write_json
 from acmr.text import one_line
 from sweeps.folder import SweepFolder
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+_SCRIPT = Path(__file__).resolve().parent.parent / "run.py"
+#: The checkout that this is; None: the program is installed, and found from anywhere.
+CHECKOUT = _SCRIPT.parent if _SCRIPT.is_file() else None
+#: A checkout's own file, whatever else is installed; else a module, and not the folder's own before it (-P).
+_STARTER = [str(_SCRIPT)] if CHECKOUT else ["-P", "-m", "acmr_app.training"]
 #: Environment variable with the process that a training must not outlive.
 PARENT = "ACMR_SWEEP_WORKER"
 #: Signals that end a sweep in good order; its processes inherit that they are blocked.
@@ -101,7 +105,7 @@ class TrainingProcess:
         variables = {f"{library}_NUM_THREADS": str(threads) for library in ("OMP", "MKL", "OPENBLAS")}
         with open(open_to_append(log_file), "ab") as log:
             self._log_file, self._start = log_file, log.tell()
-            self._process = _start([sys.executable, str(REPOSITORY / "run.py"), f"@{job_file}"], variables, log)
+            self._process = _start([sys.executable, *_STARTER, f"@{job_file}"], variables, log)
 
     def wait(self, seconds: float = _POLL) -> int | None:
         """The exit code, negative for a signal; None if it still runs after ``seconds``."""

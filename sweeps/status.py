@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from acmr.command import command
+from acmr.command import command, typed
 from acmr.names import terminal
 from acmr.records import CONFIG_FILE, FAILED, RUNNING, SEED_FOLDER, STATUS_FILE
 from acmr.run_folders import RunFolder, run_folders
@@ -73,11 +73,11 @@ def _seed(directory: Path) -> int:
 @command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints the table; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m sweeps.status", description=__doc__)
+    parser = argparse.ArgumentParser(prog=typed("status"), description=__doc__)
     parser.add_argument("output_dir", nargs="?", type=Path, default=Path("runs"), help="folder of all runs (runs)")
     output_dir = parser.parse_args(arguments).output_dir
     if not output_dir.is_dir():
-        print(f"{output_dir}: no runs there yet; python run.py trains one")
+        print(f"{output_dir}: no runs there yet; {typed()} trains one")
         return 0
     output_dir = output_dir.absolute()
     folders = run_folders(output_dir)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import signal
 import sys
 import time
@@ -24,7 +23,7 @@ from acmr.settings.files import place_of_text
 from acmr.settings.sources import sources_of
 from acmr.storage.durable import WriteError
 from acmr.text import one_line
-from sweeps.display import Display, print_plan
+from sweeps.display import Display, command_line, print_plan
 from sweeps.estimate import estimate
 from sweeps.folder import FINAL, State, SweepFolder, SweepRun, all_folders
 from sweeps.job import STOP_SIGNALS, write_job
@@ -101,7 +100,7 @@ class Sweep:
     def __init__(self, plan: Plan, output_dir: Path, settings: Settings, adapter: LauncherAdapter) -> None:
         self._plan, self._settings, self._adapter = plan, settings, adapter
         # Kept here, too: what becomes of the sweep's folder is no reason to forget it.
-        self._typed = shlex.join(["python", *_typed()])
+        self._typed = command_line()
         header = {
             "command": self._typed,
             "retries": settings.retries,
@@ -261,11 +260,6 @@ def check_swept(params: Mapping[str, object], config: DictConfig) -> None:
             continue
         place, file = sources().file(f"matrix/{config.hydra.runtime.choices.get('matrix')}")
         raise ConfigError(f"{place}: hydra.sweeper.params: {unknown_key(key)}{place_of_text(file, key)}")
-
-
-def _typed() -> list[str]:
-    """The command line as it was typed, not as Hydra got it; in a notebook Python's own is that of the kernel."""
-    return ["run.py", *sys.argv[1:]] if "ipykernel" in sys.modules else sys.orig_argv[1:]
 
 
 def _check(settings: Settings) -> None:

@@ -87,6 +87,11 @@ def test_only_the_border_knows_hydra(path):
         assert not tops & {"hydra", "omegaconf"}
 
 
+def test_only_the_top_of_the_package_knows_where_users_come_in():
+    importers = {module for module, path in MODULES.items() if any(n.startswith("acmr_app") for n in imports(path))}
+    assert {module for module in importers if not module.startswith("acmr_app")} <= {"acmr", "acmr.__main__"}
+
+
 def test_there_is_no_circle_and_nobody_imports_a_command_line():
     graph = {module: imports(path) & MODULES.keys() - {module} for module, path in MODULES.items()}
     # Raises CycleError with the circle.

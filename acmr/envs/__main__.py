@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 
-from acmr.command import command
+from acmr.command import add_own_modules, command, typed
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs import describe
 from acmr.envs.construct import find_spec, gym_ids
@@ -54,9 +54,10 @@ def details(name: str) -> Iterator[str]:
 @command
 def main() -> int:
     """Runs the command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m acmr.envs", description=__doc__)
+    parser = argparse.ArgumentParser(prog=typed("envs"), description=__doc__)
     parser.add_argument("name", nargs="?", metavar="NAME", help="an environment of conf/env, or any Gymnasium id")
     name = parser.parse_args().name
+    add_own_modules()
     try:
         for line in overview() if name is None else details(name):
             print(terminal(line))
@@ -68,7 +69,7 @@ def main() -> int:
 
 def _find(name: str) -> EnvConfig:
     if name == ANY:
-        raise ConfigError(f"{name}: takes any Gymnasium id; type python -m acmr.envs Hopper-v5, for instance")
+        raise ConfigError(f"{name}: takes any Gymnasium id; type {typed('envs')} Hopper-v5, for instance")
     known = options("env")
     if name not in known:
         try:
@@ -79,7 +80,7 @@ def _find(name: str) -> EnvConfig:
             near = near_matches(name, [*known, *gym_ids()])
             hint = f"; near: {', '.join(near)}" if near else ""
             why = f"neither in conf/env nor a Gymnasium id{hint}"
-            raise ConfigError(f"{name}: {why}; python -m acmr.envs lists") from error
+            raise ConfigError(f"{name}: {why}; {typed('envs')} lists") from error
     return environment_config(name)
 
 

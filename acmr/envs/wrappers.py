@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
+from acmr.command import typed
 from acmr.config import ConfigError
 
 
@@ -34,7 +35,7 @@ def kept_rows(wanted: Sequence[int | str], names: Sequence[str], *, key: str, en
     for entry in wanted:
         rows = _matches(entry, names)
         if not rows:
-            raise ConfigError(f"{given}: {_unknown(entry, names)}; python -m acmr.envs {environment} lists them all")
+            raise ConfigError(f"{given}: {_unknown(entry, names)}; {typed('envs')} {environment} lists them all")
         dropped.update(rows)
     if len(dropped) == len(names):
         raise ConfigError(f"{given}: nothing would be left of {environment}'s {len(names)}; drop fewer")

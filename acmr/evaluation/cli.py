@@ -15,6 +15,7 @@ from pathlib import Path
 
 import torch
 
+from acmr.command import typed
 from acmr.config import IMPUTATIONS, MEAN, ConfigError
 from acmr.evaluation.camera import without_gl
 from acmr.evaluation.evaluate import evaluate, still
@@ -42,16 +43,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parse(arguments: list[str]) -> argparse.Namespace:
     if arguments[:1] == ["still"]:
-        parser = argparse.ArgumentParser(prog="python -m acmr.evaluation still", description=still.__doc__)
+        parser = argparse.ArgumentParser(prog=f"{typed('evaluate')} still", description=still.__doc__)
         parser.add_argument("environment", help="an environment of conf/env, or any Gymnasium id")
         parser.add_argument("--out", type=Path, required=True, metavar="FILE.png")
         _add_size(parser)
         parser.set_defaults(action=still)
         return parser.parse_args(arguments[1:])
     parser = argparse.ArgumentParser(
-        prog="python -m acmr.evaluation",
+        prog=typed("evaluate"),
         description="Evaluates the policy of a finished run.",
-        epilog="python -m acmr.evaluation still ENVIRONMENT --out FILE.png draws a robot.",
+        epilog=f"{typed('evaluate')} still ENVIRONMENT --out FILE.png draws a robot.",
     )
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR", help="as in runs/quick/ant-none/seed_1")
     parser.add_argument("--episodes", type=_positive, default=10, help="default: 10")

@@ -123,13 +123,15 @@ def versions() -> dict[str, str]:
 
 def git_commit() -> str | None:
     """Commit of this checkout, with ``-dirty`` if tracked files differ from it; None outside a checkout."""
-    folder = Path(__file__).resolve().parent
+    file = Path(__file__).resolve()
 
     def git(*arguments: str) -> str:
-        command = ["git", "-C", str(folder), *arguments]
+        command = ["git", "-C", str(file.parent), *arguments]
         return subprocess.run(command, check=True, capture_output=True, text=True, timeout=20).stdout.strip()
 
     try:
+        # Installed in somebody's virtual environment it may lie in a repository that has nothing to do with it.
+        git("ls-files", "--error-unmatch", file.name)
         commit = git("rev-parse", "HEAD")
         return commit + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.SubprocessError):

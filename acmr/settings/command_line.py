@@ -12,6 +12,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 
+from acmr.command import typed
 from acmr.config import ConfigError
 from acmr.settings.compose import CONFIG_FOLDER, PATH_KEYS, as_override, groups, look_in, options
 from acmr.settings.sources import SWEEPS, Sources
@@ -35,12 +36,19 @@ def hydra_arguments(given: Sequence[str]) -> list[str]:
     chosen = _check_options(given)
     searched = [place for argument in given if _is_search_path(argument) for place in _searched(argument)]
     folder = [f"file://{Path(chosen.config_dir).absolute()}"] if chosen.config_dir else []
-    main = CONFIG_FOLDER.parent / chosen.config_path if chosen.config_path else CONFIG_FOLDER
+    main = Path(chosen.config_path).absolute() if chosen.config_path else CONFIG_FOLDER
     # Until Hydra says what it has found: so that what is wrong with a file can be said with its place.
     look_in(Sources((f"file://{main}", *folder, *dict.fromkeys([*searched, SWEEPS])), chosen.config_name or "config"))
-    arguments = [_in_hydras_words(argument) for argument in given]
+    arguments = [_in_hydras_words(_absolute(argument, chosen.config_path)) for argument in given]
     several = any(argument.partition("=")[0] in SWEEP_WORDS for argument in given)
     return ["--multirun", *arguments] if several else arguments
+
+
+def _absolute(argument: str, config_path: str | None) -> str:
+    """An option that names the folder that everything begins in; Hydra would look for it beside its own caller."""
+    if config_path and argument in (config_path, f"--config-path={config_path}"):
+        return argument.removesuffix(config_path) + str(Path(config_path).absolute())
+    return argument
 
 
 def _in_hydras_words(argument: str) -> str:
@@ -108,7 +116,7 @@ def _check_options(given: Sequence[str]) -> argparse.Namespace:
         # What Jupyter tells its kernel; a cell that calls run.main() finds it in sys.argv.
         raise ConfigError(
             f"{' '.join(given)}: these are the words of a notebook's kernel; type %run run.py seed=1 in a cell, "
-            "or !python run.py seed=1"
+            f"or !{typed()} seed=1"
         )
     parser = get_args_parser()
     # Else it would print its usage.
@@ -116,11 +124,11 @@ def _check_options(given: Sequence[str]) -> argparse.Namespace:
     try:
         known, unknown = parser.parse_known_args(list(given))
     except argparse.ArgumentError as error:
-        raise ConfigError(f"{error}; python run.py --hydra-help lists the options") from error
+        raise ConfigError(f"{error}; {typed()} --hydra-help lists the options") from error
     if known.config_dir is not None and not Path(known.config_dir).is_dir():
         raise ConfigError(f"--config-dir {known.config_dir}: there is no such folder")
     if unknown and not unknown[0].startswith("-"):
         raise ConfigError(f"{unknown[0]}: stands behind an option; options such as -m go before all settings")
     if unknown:
-        raise ConfigError(f"{unknown[0]}: no such option; python run.py --hydra-help lists them")
+        raise ConfigError(f"{unknown[0]}: no such option; {typed()} --hydra-help lists them")
     return known

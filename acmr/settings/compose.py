@@ -22,13 +22,16 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue
 
+from acmr.command import typed
 from acmr.config import ConfigError, EnvConfig, ExperimentConfig, TransferRules, flatten, schema_defaults
 from acmr.settings.files import read_files_with_care
 from acmr.settings.sources import SWEEPS, Sources
 from acmr.settings.validate import validate
 from acmr.settings.variables import refuse_variables
 
-CONFIG_FOLDER = Path(__file__).resolve().parents[2] / "conf"
+_PACKAGE = Path(__file__).resolve().parents[1]
+#: The project's settings files: within the package where it is installed, beside it in a checkout.
+CONFIG_FOLDER = next(filter(Path.is_dir, (_PACKAGE / "conf", _PACKAGE.parent / "conf")), _PACKAGE / "conf")
 #: Settings that are paths.
 PATH_KEYS = ("transfer.teacher", "output_dir", "tracking.dir")
 _given: Sources | None = None
@@ -146,7 +149,7 @@ def unknown_key(key: str) -> str:
     near = near or [known for known in keys if get_close_matches(leaf, [known.split(".")[-1]], cutoff=0.75)][:3]
     section = key.rpartition(".")[0]
     beside = [known for known in keys if section and known.rpartition(".")[0] == section]
-    others = f"there are {', '.join(beside)}" if beside else "python run.py --help lists all of them"
+    others = f"there are {', '.join(beside)}" if beside else f"{typed()} --help lists all of them"
     hint = f"did you mean {' or '.join(near)}?" if near else others
     return f"{key}: no such setting; {hint}"
 

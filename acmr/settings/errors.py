@@ -15,6 +15,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from acmr.command import typed
 from acmr.config import ConfigError, ExperimentConfig, flatten
 from acmr.names import terminal
 from acmr.settings.compose import groups, launchers, options, setting_keys, sources, unknown_key
@@ -50,7 +51,7 @@ def _explained(error: BaseException) -> str:
         if match := re.match(r"In '([^']+)': Could not override '([^'@]+)", text):
             return _wrong_choice(match[1], match[2])
         if match := re.match(r"(?:Ambiguous value for argument|Sweep parameters) '([^']+)'", text):
-            return f"{match[1]}: several values are several runs; add -m, as in python run.py -m {quote(match[1])}"
+            return f"{match[1]}: several values are several runs; add -m, as in {typed()} -m {quote(match[1])}"
         if match := re.match(r"(?:Could not override|Key) '([^']+)'", text):
             key = match[1].split("@")[0]
             if key in FREE_KEYS:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from acmr.cells import SOURCE, TARGET, cell_of, digest, run_name
+from acmr.command import typed
 from acmr.config import (
     HORIZON,
     TEACHER_CHOICE,
@@ -60,7 +61,7 @@ class RunSpec:
     @property
     def command(self) -> str:
         """The shortest command line that makes this run."""
-        return " ".join(["python run.py", *sources().words, *_short_overrides(self)])
+        return " ".join([typed(), *sources().words, *_short_overrides(self)])
 
 
 def specify(config: ExperimentConfig) -> RunSpec:

@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import asdict
 
+from acmr.command import typed
 from acmr.config import (
     ACTIVATIONS,
     EXACT,
@@ -163,7 +164,7 @@ def _check_transfer(config: ExperimentConfig) -> None:
         )
     if config.freeze and not rules.freezable:
         why = (
-            "every layer would be frozen and nothing could learn (python -m acmr.evaluation shows what a teacher does)"
+            f"every layer would be frozen and nothing could learn ({typed('evaluate')} shows what a teacher does)"
             if rules.needs_teacher
             else "without a transfer there is nothing to freeze"
         )

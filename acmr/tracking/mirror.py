@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from acmr.command import command
+from acmr.command import command, typed
 from acmr.config import ConfigError
 from acmr.foreign import is_there, read_mapping
 from acmr.names import terminal
@@ -121,7 +121,7 @@ def dashboard(folder: Path) -> None:
 @command
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m acmr.tracking.mirror", description=__doc__)
+    parser = argparse.ArgumentParser(prog=typed("mirror"), description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     again = commands.add_parser("rebuild", help="write the mirrors of runs anew from their own files")
     again.add_argument("--tracking", default="offline", choices=options("tracking"), help="default: offline (W&B)")

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from acmr.cells import CELLS, Cell, planned_cells
+from acmr.command import typed
 from acmr.names import distinct, terminal
 from acmr.records import ENDED
 from acmr.run_folders import run_folders
@@ -93,7 +94,7 @@ def load(root: Path) -> RunSet:
     """
     if not root.is_dir():
         what = "is no folder" if root.exists() else "there is no such folder"
-        raise InputError(f"{root}: {what}; give one with runs, as in runs/paper (python run.py matrix=paper makes it)")
+        raise InputError(f"{root}: {what}; give one with runs, as in runs/paper ({typed()} matrix=paper makes it)")
     found = _named([read_run(root, folder) for folder in run_folders(root)])
     runs = _runs_frame([run.row for run in found.values()])
     _one_profile(root, runs)

@@ -8,6 +8,7 @@ from shlex import quote
 
 import pandas as pd
 
+from acmr.command import typed
 from acmr.config import THRESHOLD
 from analysis.loading.load import RunSet
 from analysis.loading.read_run import DAMAGED
@@ -56,7 +57,7 @@ def missing_runs(data: RunSet) -> list[Missing]:
                 force = " force=true" if state == DAMAGED else ""
                 # A run that is there goes on as it began; one that is not ends as the others of its cell do.
                 stop = stop_words(there if len(there) else alike)
-                line = f"python run.py experiment={cell} seed={seed}{option}{stop}{force}"
+                line = f"{typed()} experiment={cell} seed={seed}{option}{stop}{force}"
                 found.append(Missing(cell, seed, state, line))
     return found
 
@@ -74,7 +75,7 @@ def command_for(runs: pd.DataFrame, seeds: Iterable[int], profile: str) -> str:
     cell = runs["cell"].iloc[0]
     if pd.isna(cell):
         return ""
-    return f"python run.py {quote(f'matrix={profile}')} experiment={cell} seed={_list(seeds)}{stop_words(runs)}"
+    return f"{typed()} {quote(f'matrix={profile}')} experiment={cell} seed={_list(seeds)}{stop_words(runs)}"
 
 
 def profile_of(data: RunSet) -> str:
@@ -88,7 +89,7 @@ def profile_of(data: RunSet) -> str:
 
 def matrix_command(data: RunSet) -> str:
     """The one command that makes all that is missing and leaves alone what is complete."""
-    words, seeds = [f"python run.py {quote(f'matrix={profile_of(data)}')}"], planned_seeds(data.runs)
+    words, seeds = [f"{typed()} {quote(f'matrix={profile_of(data)}')}"], planned_seeds(data.runs)
     stop, missing = stop_words(data.runs[data.runs["cell"].notna()]), missing_runs(data)
     if stop and missing:
         # Only what is missing is named: what is complete may have been made with another stop_after.

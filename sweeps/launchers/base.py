@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from acmr.config import ConfigError
 from acmr.settings.compose import launchers
 from sweeps.folder import SweepFolder
-from sweeps.job import REPOSITORY, STOP_SIGNALS
+from sweeps.job import CHECKOUT, STOP_SIGNALS
 
 
 class LauncherAdapter:
@@ -49,8 +49,9 @@ class LauncherAdapter:
         self.settings: DictConfig = self.config.hydra.launcher
         self.wanted: object = self.settings.get(self.workers_key, 1) if workers is None else workers
         # A job of a cluster begins in the folder where the sweep was started, which need not be this one.
-        paths = [str(REPOSITORY), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-        os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
+        if CHECKOUT is not None:
+            paths = [str(CHECKOUT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+            os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
 
     @property
     def workers(self) -> int:

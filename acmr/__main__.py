@@ -1,0 +1,7 @@
+"""``python -m acmr``: the command ``acmr``."""
+
+import sys
+
+from acmr_app.commands import main
+
+sys.exit(main())
