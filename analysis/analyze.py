@@ -11,7 +11,7 @@ import pandas as pd
 from acmr.cells import REFERENCE
 from acmr.records import SUMMARY_FILE
 from analysis.loading.load import InputError, RunSet
-from analysis.loading.missing import Missing, missing_runs, planned_seeds, profile_of
+from analysis.loading.missing import Missing, missing_runs, planned_runs, planned_seeds, profile_of
 from analysis.loading.read_run import DAMAGED, SUPERSEDED
 from analysis.statistics.comparisons import check_reference, compare_cells, compare_groups
 from analysis.statistics.early_ends import settle
@@ -52,13 +52,13 @@ class Analysis:
 
     @property
     def planned(self) -> int:
-        """Seeds that a cell is planned to have."""
+        """Seeds that a cell of the paper is planned to have."""
         return len(planned_seeds(self.data.runs))
 
     @property
     def planned_runs(self) -> int:
         """Runs that there should be: every cell with every seed."""
-        return len(self.data.cells) * self.planned
+        return planned_runs(self.data)
 
     @property
     def notices(self) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from acmr.names import terminal
 from analysis.analyze import Analysis, analyze
 from analysis.loading.load import load
-from analysis.loading.missing import matrix_command, missing_runs, planned_seeds, profile_of
+from analysis.loading.missing import matrix_command, missing_runs, planned_runs, profile_of
 from analysis.report.study import study_lines
 from analysis.report.terminal import left_out_lines, missing_lines, print_summary, result_lines
 
@@ -18,7 +18,7 @@ from analysis.report.terminal import left_out_lines, missing_lines, print_summar
 def run(options: argparse.Namespace) -> int:
     """What the command line asks for; see :func:`analysis.cli.main`."""
     data = load(options.runs)
-    missing, planned = missing_runs(data), len(data.cells) * len(planned_seeds(data.runs))
+    missing, planned = missing_runs(data), planned_runs(data)
     lines = missing_lines(missing, planned, matrix_command(data))
     if not len(data.episodes):
         said = [f"{options.runs}: no run with episodes to analyze", *left_out_lines(data.runs), *lines]

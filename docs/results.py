@@ -1,4 +1,6 @@
-"""Writes tables, captions and figures of ``docs/results.md`` from the published runs: ``python -m docs.results``.
+"""Writes the tables, captions and figures of two pages from the published runs: ``python -m docs.results``.
+
+The pages are ``docs/results.md`` and ``docs/method.md``.
 
 Each table and caption stands between two comments with its name; what stands there is replaced.
 ``tests/test_published.py`` holds the page to what this prints. The figures are those of ``make paper-figures``.
@@ -8,7 +10,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +26,14 @@ from analysis.loading.load import load
 from analysis.loading.speed import read_speed
 from analysis.report.published import side_by_side
 from analysis.report.write import figure_data
+from docs import named
+from docs.markdown import duration, number, p_value, steps, table
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE, PUBLISHED = ROOT / "docs" / "results.md", ROOT / "results" / "paper"
+PAGES = (ROOT / "docs" / "results.md", ROOT / "docs" / "method.md")
+PUBLISHED = ROOT / "results" / "paper"
 IMAGES = ROOT / "docs" / "images" / "results"
-#: Figures on the page.
+#: Figures on the pages.
 PICTURES = ("figure_4", "figure_5", "sensitivity", "kaplan_meier", "training_speed")
 #: Steps at which the first part of learning is looked at, and episodes before each that count.
 _EARLY, _BEFORE = range(25_000, 250_000, 25_000), 20
@@ -37,7 +42,7 @@ _PART = 100_000
 
 
 def tables() -> dict[str, str]:
-    """Each table in Markdown, by its name on the page."""
+    """Each table in Markdown, by its name on its page."""
     found = analyze(load(PUBLISHED))
     makers: dict[str, Callable[[Analysis], str]] = {
         "runs": _runs,
@@ -57,27 +62,32 @@ def tables() -> dict[str, str]:
     }
     data = figure_data(found)
     captions = {spec.name: spec.said(data) for spec in FIGURES if spec.name in PICTURES}
-    return {name: make(found) for name, make in makers.items()} | captions
+    return {name: make(found) for name, make in makers.items()} | captions | named.tables(found, PUBLISHED)
 
 
-def filled(page: str) -> str:
-    """The page with its tables as they are now.
+def filled() -> dict[Path, str]:
+    """The pages with their tables as they are now.
 
     Raises:
-        ValueError: If a table has no place on it.
+        ValueError: If a table has no place on any of them.
     """
-    for name, table in tables().items():
+    pages = {path: path.read_text(encoding="utf-8") for path in PAGES}
+    for name, text in tables().items():
         place = re.compile(rf"<!-- {name} -->\n.*?<!-- /{name} -->", re.DOTALL)
-        if not place.search(page):
-            raise ValueError(f"{PAGE.name} has no place for the table {name}")
-        page = place.sub(lambda _, name=name, table=table: f"<!-- {name} -->\n{table}\n<!-- /{name} -->", page)
-    return page
+        path = next((path for path, page in pages.items() if place.search(page)), None)
+        if path is None:
+            raise ValueError(f"no page has a place for the table {name}")
+        between = f"<!-- {name} -->\n{text}\n<!-- /{name} -->"
+        pages[path] = place.sub(lambda _, between=between: between, pages[path])
+    return pages
 
 
 def draw() -> None:
     """Draws the figures of the page."""
     apply()
-    data = figure_data(analyze(load(PUBLISHED)))
+    found = analyze(load(PUBLISHED))
+    save(named.picture(found), IMAGES, "named", ("png",))
+    data = figure_data(found)
     for spec in FIGURES:
         figure = spec.draw(data, PALETTES[0]) if spec.name in PICTURES else None
         if figure is not None:
@@ -104,11 +114,11 @@ def _runs(found: Analysis) -> str:
                 *(run["cell"], int(run["seed"])),
                 *(f"{met:,}" if met else "not reached", f"{first:,}" if first else "–"),
                 *(f"{told['episodes']:,}", f"{told['final_return']:,.0f}", end),
-                *(f"{told['steps_per_second']:.0f}", _duration(told["wall_seconds"])),
+                *(f"{told['steps_per_second']:.0f}", duration(told["wall_seconds"])),
             ]
         )
     heads = ["cell", "seed", "steps to threshold", "first of the five", "episodes", "return, last 10", "ended"]
-    return _table([*heads, "steps per second", "wall time"], rows)
+    return table([*heads, "steps per second", "wall time"], rows)
 
 
 def _cells(found: Analysis) -> str:
@@ -116,8 +126,8 @@ def _cells(found: Analysis) -> str:
     for row in found.cells.to_dict("records"):
         runs, reached = int(row["runs"]), int(row["reached"])
         if runs:
-            rows.append([row["group"], f"{reached} of {runs}", _steps(row["mean"]), _steps(row["std"])])
-    return _table(["cell", "reached", "mean steps to threshold", "standard deviation"], rows)
+            rows.append([row["group"], f"{reached} of {runs}", steps(row["mean"]), steps(row["std"])])
+    return table(["cell", "reached", "mean steps to threshold", "standard deviation"], rows)
 
 
 def _comparisons(found: Analysis) -> str:
@@ -126,19 +136,19 @@ def _comparisons(found: Analysis) -> str:
     for printed in side_by_side(found.table3).to_dict("records"):
         pair = (printed["reference"], printed["index"])
         row = ours[pair]
-        low, high = _steps(row["difference_low"]), _steps(row["difference_high"])
+        low, high = steps(row["difference_low"]), steps(row["difference_high"])
         rows.append(
             [
                 f"{pair[1]} − {pair[0]}",
-                *(_number(printed["t_published"], 2), _p(printed["p_published"])),
+                *(number(printed["t_published"], 2), p_value(printed["p_published"])),
                 f"{row['runs_index']} + {row['runs_reference']}",
-                *(_number(row["t_score"], 2), _p(row["p_value"]), _p(row["p_holm"])),
-                f"{_steps(row['difference'])} ({low} to {high})" if low != "–" else "–",
-                *(_p(row["p_permutation"]), _p(row["p_log_rank"])),
+                *(number(row["t_score"], 2), p_value(row["p_value"]), p_value(row["p_holm"])),
+                f"{steps(row['difference'])} ({low} to {high})" if low != "–" else "–",
+                *(p_value(row["p_permutation"]), p_value(row["p_log_rank"])),
             ]
         )
     heads = ["index − reference", "t, paper", "p, paper", "runs", "t", "p", "p after Holm", "difference (95%)"]
-    return _table([*heads, "p, permutations", "p, log-rank"], rows)
+    return table([*heads, "p, permutations", "p, log-rank"], rows)
 
 
 def _replication(found: Analysis) -> str:
@@ -149,7 +159,7 @@ def _replication(found: Analysis) -> str:
             expected = _range(row, "g_predicted", 2)
             rows.append([_pair(row), sides[0], expected, sides[1], row["replicates"].replace("-", "–")])
     heads = ["index − reference", "g, paper (95%)", "to be expected here", "g (95%)", "ours lies"]
-    return _table(heads, rows)
+    return table(heads, rows)
 
 
 def _sensitivity(found: Analysis) -> str:
@@ -159,7 +169,7 @@ def _sensitivity(found: Analysis) -> str:
         [_pair(row), row["runs"], row["criterion"], *(row[limit] or "–" for limit in limits)]
         for row in points.to_dict("records")
     ]
-    return _table(["index − reference", "runs", "criterion", *limits], rows)
+    return table(["index − reference", "runs", "criterion", *limits], rows)
 
 
 def _overview(found: Analysis) -> str:
@@ -167,50 +177,49 @@ def _overview(found: Analysis) -> str:
     for row in found.study.overview.to_dict("records"):
         runs = f"{row['basis']}, {row['runs_index']} + {row['runs_reference']}"
         ahead = f"{row['faster']} of {row['known']}"
-        rows.append([_pair(row), runs, ahead, *(_steps(row[end]) for end in ("lowest", "asked", "highest"))])
-    return _table(["index − reference", "runs", "index faster at", "lowest", "at 4900, 5 in a row", "highest"], rows)
+        rows.append([_pair(row), runs, ahead, *(steps(row[end]) for end in ("lowest", "asked", "highest"))])
+    return table(["index − reference", "runs", "index faster at", "lowest", "at 4900, 5 in a row", "highest"], rows)
 
 
 def _paired(found: Analysis) -> str:
     rows = []
     for row in found.study.paired.to_dict("records"):
         counts = [f"{row[name]:.0f}" if pd.notna(row[name]) else "–" for name in ("pairs", "shared_episodes", "faster")]
-        tests = [_p(row[name]) for name in ("p_paired", "p_sign_flip", "p_restricted", "p_value")]
-        rows.append([_pair(row), *counts, _number(row["correlation"], 2), _difference(row, "difference"), *tests])
+        tests = [p_value(row[name]) for name in ("p_paired", "p_sign_flip", "p_restricted", "p_value")]
+        rows.append([_pair(row), *counts, number(row["correlation"], 2), _difference(row, "difference"), *tests])
     heads = ["index − reference", "seeds", "equal episodes", "index faster on", "correlation", "difference (95%)"]
-    return _table([*heads, "p, paired t", "p, signs", "p, signs, restricted", "p, not paired"], rows)
+    return table([*heads, "p, paired t", "p, signs", "p, signs, restricted", "p, not paired"], rows)
 
 
 def _blocks(found: Analysis) -> str:
     rows = [
         [
-            *(row["cells"], row["seeds"], _number(row["f_score"], 2), _p(row["p_value"])),
-            *(_number(row["friedman"], 2), _p(row["p_permutation"]), _number(row["share_of_seeds"], 2)),
+            *(row["cells"], row["seeds"], number(row["f_score"], 2), p_value(row["p_value"])),
+            *(number(row["friedman"], 2), p_value(row["p_permutation"]), number(row["share_of_seeds"], 2)),
         ]
         for row in found.study.blocks.to_dict("records")
     ]
-    return _table(["cells", "seeds", "F", "p", "Friedman", "p, exact", "share of the seeds"], rows)
+    return table(["cells", "seeds", "F", "p", "Friedman", "p, exact", "share of the seeds"], rows)
 
 
 def _equivalence(found: Analysis) -> str:
     rows = []
     for row in found.study.equivalence.to_dict("records"):
-        ends = (_steps(row[end]) for end in ("margin", "least_margin"))
+        ends = (steps(row[end]) for end in ("margin", "least_margin"))
         alike = row["equivalent"] or "–"
-        rows.append(
-            [_pair(row), *ends, _difference(row, "difference"), _p(row["p_tost"]), _p(row["p_tost_paired"]), alike]
-        )
+        tests = (p_value(row[name]) for name in ("p_tost", "p_tost_paired"))
+        rows.append([_pair(row), *ends, _difference(row, "difference"), *tests, alike])
     heads = ["index − reference", "margin", "least margin", "difference (90%)", "p", "p, paired"]
-    return _table([*heads, "alike"], rows)
+    return table([*heads, "alike"], rows)
 
 
 def _cost(found: Analysis) -> str:
     rows = []
     for row in found.study.cost.to_dict("records"):
         names = ("own_steps", "teacher_steps", "total_steps", "saved_steps", "students_to_repay")
-        rows.append([row["group"], row["runs"], *(_steps(row[name]) for name in names)])
+        rows.append([row["group"], row["runs"], *(steps(row[name]) for name in names)])
     heads = ["cell", "runs", "own steps", "teacher's", "both", "saved against its baseline", "students to repay"]
-    return _table(heads, rows)
+    return table(heads, rows)
 
 
 def _pair(row: dict[Hashable, Any]) -> str:
@@ -218,16 +227,16 @@ def _pair(row: dict[Hashable, Any]) -> str:
 
 
 def _difference(row: dict[Hashable, Any], name: str) -> str:
-    low, high = _steps(row["low"]), _steps(row["high"])
-    return f"{_steps(row[name])} ({low} to {high})" if low != "–" else _steps(row[name])
+    low, high = steps(row["low"]), steps(row["high"])
+    return f"{steps(row[name])} ({low} to {high})" if low != "–" else steps(row[name])
 
 
 def _interval(row: dict[Hashable, Any], name: str, digits: int) -> str:
-    return f"{_number(row[name], digits)} ({_range(row, name, digits)})" if pd.notna(row[name]) else "–"
+    return f"{number(row[name], digits)} ({_range(row, name, digits)})" if pd.notna(row[name]) else "–"
 
 
 def _range(row: dict[Hashable, Any], name: str, digits: int) -> str:
-    low, high = (_number(row[f"{name}_{end}"], digits) for end in ("low", "high"))
+    low, high = (number(row[f"{name}_{end}"], digits) for end in ("low", "high"))
     return f"{low} to {high}" if low != "–" else "–"
 
 
@@ -242,7 +251,7 @@ def _evaluations(found: Analysis) -> str:
         numbers = [f"{told[key]:,.0f}" for key in ("mean_return", "std_return", "min_return")]
         speed = f"{told['mean_forward_velocity']:.2f}"
         rows.append([run["cell"], int(run["seed"]), *numbers, f"{falls} of {told['episodes']}", speed])
-    return _table(["cell", "seed", "mean return", "its SD", "lowest", "ended in a fall", "m/s"], rows)
+    return table(["cell", "seed", "mean return", "its SD", "lowest", "ended in a fall", "m/s"], rows)
 
 
 def _early(found: Analysis) -> str:
@@ -254,7 +263,7 @@ def _early(found: Analysis) -> str:
             before = own[own["global_step"] <= step]["episodic_return"].tail(_BEFORE)
             values.append(f"{before.mean():,.0f}" if own["global_step"].iloc[-1] >= step else "ended")
         rows.append([run["cell"], int(run["seed"]), *values])
-    return _table(["cell", "seed", *(f"{step:,}" for step in _EARLY)], rows)
+    return table(["cell", "seed", *(f"{step:,}" for step in _EARLY)], rows)
 
 
 def _parts(found: Analysis) -> str:
@@ -269,7 +278,7 @@ def _parts(found: Analysis) -> str:
             speed = part[VELOCITY_COLUMN].mean()
             numbers = [f"{returns:,.0f}", f"{lengths:,.0f}", f"{speed:.2f}", f"{whole:.0%}"]
             rows.append([run["cell"], int(run["seed"]), f"to {end:,}", *numbers])
-    return _table(["cell", "seed", "steps", "return", "length", "m/s", "full length"], rows)
+    return table(["cell", "seed", "steps", "return", "length", "m/s", "full length"], rows)
 
 
 def _speed(found: Analysis) -> str:
@@ -278,36 +287,15 @@ def _speed(found: Analysis) -> str:
         speed = read_speed(PUBLISHED / name, float(run["learning_starts"]))
         parts = [speed[(speed["step"] > end - _PART) & (speed["step"] <= end)] for end in (100_000, 500_000, 1_000_000)]
         rows.append([run["cell"], int(run["seed"]), *(f"{part['steps_per_second'].median():.0f}" for part in parts)])
-    return _table(["cell", "seed", "to 100,000", "to 500,000", "to 1,000,000"], rows)
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
-
-
-def _duration(seconds: float) -> str:
-    hours, minutes = divmod(round(seconds / 60), 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
-
-
-def _steps(value: float) -> str:
-    return "–" if pd.isna(value) else f"{value:,.0f}".replace("-", "−")
-
-
-def _number(value: float, digits: int) -> str:
-    return "–" if pd.isna(value) else f"{value:.{digits}f}".replace("-", "−")
-
-
-def _p(value: float) -> str:
-    return "–" if pd.isna(value) else f"{value:.3f}"
+    return table(["cell", "seed", "to 100,000", "to 500,000", "to 1,000,000"], rows)
 
 
 def main() -> None:
-    """Fills the page and draws its figures."""
-    PAGE.write_text(filled(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    """Fills the pages and draws their figures."""
+    for path, page in filled().items():
+        path.write_text(page, encoding="utf-8")
+        print(f"written: {path.relative_to(ROOT)}")
     draw()
-    print(f"written: {PAGE.relative_to(ROOT)}")
 
 
 if __name__ == "__main__":

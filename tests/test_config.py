@@ -260,6 +260,15 @@ def test_students_take_teachers_in_turn(seed, turns, teacher):
     assert ("transfer.teacher_seeds=3" in student.command) == (turns == 3)
 
 
+def test_the_papers_random_start_is_a_cell_of_its_own():
+    student = spec("experiment=N2", "stop=threshold")
+    by_hand = spec("env=armless_humanoid", "transfer=named", "agent.start=random", "stop=threshold")
+    for found in (student, by_hand):
+        assert (found.cell, found.name) == ("N2", "armless_humanoid-named-start=random-stop=threshold")
+    assert student.config == by_hand.config
+    assert (student.config.agent.warmup, student.config.agent.kickstart) == (5000, 10)
+
+
 def test_no_turn_is_none():
     with pytest.raises(ConfigError, match=r"transfer\.teacher_seeds=0: an integer of at least 1"):
         spec("experiment=N1", "transfer.teacher_seeds=0")

@@ -8,6 +8,7 @@ from shlex import quote
 
 import pandas as pd
 
+from acmr.cells import CELLS
 from acmr.command import typed
 from acmr.config import THRESHOLD
 from analysis.loading.load import RunSet
@@ -34,10 +35,25 @@ class Missing:
     command: str
 
 
-def planned_seeds(runs: pd.DataFrame) -> list[int]:
-    """The paper's seeds and all others that a cell has been run with."""
-    seen = runs.loc[runs["cell"].notna() & runs["seed"].notna(), "seed"]
+def planned_seeds(runs: pd.DataFrame, cell: str | None = None) -> list[int]:
+    """Seeds that a cell should have: the paper's, and all others that one of the paper's cells has been run with.
+
+    A cell that goes beyond the paper has those that it was run with itself in the place of the latter: ten seeds of a
+    method that takes minutes do not ask for ten of one that takes hours.
+
+    Args:
+        runs: All runs.
+        cell: The cell; None: those of the paper.
+    """
+    beyond = cell is not None and not CELLS[cell].published
+    own = [cell] if beyond else [row.name for row in CELLS.values() if row.published]
+    seen = runs.loc[runs["cell"].isin(own) & runs["seed"].notna(), "seed"]
     return sorted({*PAPER_SEEDS, *(int(seed) for seed in seen)})
+
+
+def planned_runs(data: RunSet) -> int:
+    """Runs that there should be: every cell with every seed planned for it."""
+    return sum(len(planned_seeds(data.runs, cell.name)) for cell in data.cells)
 
 
 def missing_runs(data: RunSet) -> list[Missing]:
@@ -50,7 +66,7 @@ def missing_runs(data: RunSet) -> list[Missing]:
         own = runs[runs["cell"] == cell]
         # Students need the whole of their teacher; any other cell that has no run yet ends as those of the folder do.
         alike = own if len(own) or teaches else runs[runs["cell"].notna()]
-        for seed in planned_seeds(runs):
+        for seed in planned_seeds(runs, cell):
             there = own[own["seed"] == seed]
             if not there["counted"].any():
                 state = str(there["state"].iloc[0]) if len(there) else "missing"
@@ -91,8 +107,9 @@ def matrix_command(data: RunSet) -> str:
     """The one command that makes all that is missing and leaves alone what is complete."""
     words, seeds = [f"{typed()} {quote(f'matrix={profile_of(data)}')}"], planned_seeds(data.runs)
     stop, missing = stop_words(data.runs[data.runs["cell"].notna()]), missing_runs(data)
-    if stop and missing:
-        # Only what is missing is named: what is complete may have been made with another stop_after.
+    if missing and (stop or any(run.seed not in seeds for run in missing)):
+        # Only what is missing is named: what is complete may have been made with another stop_after, and further seeds
+        # of one cell are none of the others'.
         cells, lacking = dict.fromkeys(run.cell for run in missing), sorted({run.seed for run in missing})
         return f"{words[0]} experiment={_list(cells)} seed={_list(lacking)}{stop}"
     if not all(cell.published for cell in data.cells):
