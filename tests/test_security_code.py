@@ -39,6 +39,11 @@ CODE: list[tuple[dict[str, Any], str]] = [
     ({"kwargs": {"wrappers": ["evil_module.Wrapper"]}}, "env.kwargs.wrappers"),
     ({"kwargs": {"anything": {"at": ["any", "depth"]}}}, "env.kwargs.anything"),
     ({"kwargs": {"frame_skip": 5, "env_id": "evil"}}, "env.kwargs.env_id"),
+    # What never ends is no better than what it might run.
+    ({"kwargs": {"frame_skip": 10**9}}, "env.kwargs.frame_skip=1000000000"),
+    ({"kwargs": {"frame_skip": [1, {"a": -(10**9)}]}}, "env.kwargs.frame_skip=[1, {'a': -1000000000}]"),
+    ({"kwargs": {"legs": 10**9}}, "env.kwargs.legs=1000000000"),
+    ({"max_episode_steps": 10**15}, "env.max_episode_steps=1000000000000000"),
 ]
 
 

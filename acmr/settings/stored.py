@@ -19,6 +19,9 @@ from acmr.settings.validate import check_environment
 
 #: How a reference to another setting, or to a variable of the reader's, begins; no run stores one.
 _REFERENCE = "${"
+#: What a stored environment may ask for unasked: frames of a step, steps of an episode, any other whole number. A step of
+#: a thousand million frames cannot even be interrupted.
+_MOST_FRAMES, _MOST_STEPS, _MOST = 1_000, 1_000_000, 1_000_000
 
 
 def stored_config(settings: object) -> ExperimentConfig:
@@ -42,7 +45,7 @@ def stored_environment(settings: object, place: object, remedy: str, trust: bool
         trust: Whether the user has typed that.
 
     Raises:
-        ConfigError: If there is none, or if it would run code, or read files, that the user has not chosen.
+        ConfigError: If there is none, or if it would run code, read files, or take a time, that the user has not chosen.
     """
     try:
         stored = _mapping(_mapping(settings).get("env"))
@@ -58,6 +61,11 @@ def stored_environment(settings: object, place: object, remedy: str, trust: bool
     if chosen and not trust and not _is_in_conf(config):
         raise ConfigError(
             f"{place}: {', '.join(chosen)} would run code or read files that this file chooses, not you; "
+            f"if you trust it, {remedy}"
+        )
+    if (long := list(_endless(config))) and not trust and not _is_in_conf(config, limit=True):
+        raise ConfigError(
+            f"{place}: {', '.join(long)} would keep this machine busy for as long as this file chooses, not you; "
             f"if you trust it, {remedy}"
         )
     return config
@@ -86,7 +94,24 @@ def _is_number(value: object) -> bool:
     return all(map(_is_number, value)) if isinstance(value, list) else isinstance(value, int | float | None)
 
 
-def _is_in_conf(config: EnvConfig) -> bool:
+def _endless(config: EnvConfig) -> Iterator[str]:
+    """What in an environment's settings may make an evaluation that never ends."""
+    if (config.max_episode_steps or 0) > _MOST_STEPS:
+        yield f"env.max_episode_steps={config.max_episode_steps}"
+    for key, value in config.kwargs.items():
+        most = _MOST_FRAMES if key == "frame_skip" else _MOST
+        if any(abs(number) > most for number in _whole_numbers(value)):
+            yield f"env.kwargs.{key}={value}"
+
+
+def _whole_numbers(value: object) -> Iterator[int]:
+    if isinstance(value, int):
+        yield value
+    for entry in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from _whole_numbers(entry)
+
+
+def _is_in_conf(config: EnvConfig, limit: bool = False) -> bool:
     """Whether the user's own file for this environment names the same."""
     if config.name not in options("env"):
         return False
@@ -94,7 +119,8 @@ def _is_in_conf(config: EnvConfig) -> bool:
         own = environment_config(config.name)
     except ConfigError:
         return False
-    return (own.id, own.kwargs) == (config.id, config.kwargs)
+    limits = (own.max_episode_steps, config.max_episode_steps) if limit else (None, None)
+    return (own.id, own.kwargs, limits[0]) == (config.id, config.kwargs, limits[1])
 
 
 def _mapping(settings: object) -> Mapping[Any, Any]:
