@@ -16,6 +16,7 @@ import pytest
 import yaml
 from analysis_runs import rows_reaching, write_run
 from finished_run import ANT, make_run
+from test_analysis_report import CHROMIUM, Browser
 
 from acmr.evaluation.cli import main as evaluation
 from acmr.settings.errors import explain
@@ -110,6 +111,34 @@ def test_the_policy_allows_the_pages_own_style_and_script_and_nothing_else(resul
         digest = base64.b64encode(hashlib.sha256("".join(texts).encode()).digest()).decode()
         assert f"{kind}-src 'sha256-{digest}'" in policy
         assert len("".join(texts)) > 1_000
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
+def test_nothing_but_the_pages_own_script_runs(results, tmp_path):
+    # As if a name had become a part of the page after all.
+    ways = """
+        window.blocked = []
+        document.addEventListener("securitypolicyviolation", event => window.blocked.push(event.effectiveDirective))
+        const script = document.createElement("script")
+        script.textContent = "window.ran = 1"
+        const place = document.createElement("div")
+        place.innerHTML = `<b class=evil onclick="window.ran = 2"></b><p style="color: red"></p>
+            <a class=evil href="javascript:window.ran = 3"></a><img src="http://127.0.0.1:9/x">
+            <iframe srcdoc="<script>parent.ran = 4</script>"></iframe>`
+        document.body.append(script, place)
+        for (const evil of document.querySelectorAll(".evil")) evil.click()
+        new Promise(then => setTimeout(() => then([window.ran || 0, [...new Set(window.blocked)]]), 500))
+    """
+    browser = Browser(tmp_path / "profile")
+    try:
+        browser.open(results[0] / "report.html")
+        assert set(browser.run("[...document.links].map(link => link.protocol)")) == {"file:"}
+        ran, blocked = browser.run(ways)
+    finally:
+        browser.close()
+    assert ran == 0
+    assert {"script-src-elem", "script-src-attr", "style-src-attr", "img-src"} <= set(blocked), blocked
 
 
 def test_tables_compute_nothing_and_stay_tables(results):

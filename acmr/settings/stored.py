@@ -19,8 +19,8 @@ from acmr.settings.validate import check_environment
 
 #: How a reference to another setting, or to a variable of the reader's, begins; no run stores one.
 _REFERENCE = "${"
-#: What a stored environment may ask for unasked: frames of a step, steps of an episode, any other whole number. A step of
-#: a thousand million frames cannot even be interrupted.
+#: What a stored environment may ask for unasked: frames of a step, steps of an episode, any other whole number. A step
+#: of a thousand million frames cannot even be interrupted.
 _MOST_FRAMES, _MOST_STEPS, _MOST = 1_000, 1_000_000, 1_000_000
 
 
@@ -45,7 +45,7 @@ def stored_environment(settings: object, place: object, remedy: str, trust: bool
         trust: Whether the user has typed that.
 
     Raises:
-        ConfigError: If there is none, or if it would run code, read files, or take a time, that the user has not chosen.
+        ConfigError: If there is none, or if it would run code, read files or take a time that the user has not chosen.
     """
     try:
         stored = _mapping(_mapping(settings).get("env"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -164,19 +165,25 @@ def _wrong_entries(about: TeacherDescription) -> list[str]:
         fits = list_of(value, float) and isinstance(value, list) and len(value) == len(about.action_names)
         return fits and isinstance(value, list) and all(math.isfinite(entry) for entry in value)
 
+    def finite(value: object) -> bool:
+        # A whole number of JSON may be one that no float holds.
+        return isinstance(value, int | float) and abs(value) <= sys.float_info.max
+
+    names = {key: list_of(getattr(about, key), str) for key in ("observation_names", "action_names")}
+    if not all(names.values()):
+        # All others are judged by how many there are.
+        return [name for name, is_good in names.items() if not is_good]
     texts = ("environment", "environment_id", "model_hash", "profile", "sha256", "full_sha256")
     good = {
-        "observation_names": list_of(about.observation_names, str),
-        "action_names": list_of(about.action_names, str),
         "action_low": bounds(about.action_low),
         "action_high": bounds(about.action_high),
         "hidden_sizes": widths(about.hidden_sizes),
         "core": about.core is None or (widths(about.core) and len(about.core) == 2),
-        "log_alpha": isinstance(about.log_alpha, int | float) and math.isfinite(about.log_alpha),
+        "log_alpha": finite(about.log_alpha),
         "seed": type(about.seed) is int,
         "global_step": type(about.global_step) is int,
-        "final_return": about.final_return is None or isinstance(about.final_return, int | float),
-        "adapter_activation": about.adapter_activation in ACTIVATIONS,
+        "final_return": about.final_return is None or finite(about.final_return),
+        "adapter_activation": isinstance(about.adapter_activation, str) and about.adapter_activation in ACTIVATIONS,
         "config": isinstance(about.config, dict),
         "precision": about.precision in (FULL, HALF),
         "statistics": about.statistics is None or _are_statistics(about.statistics, about.dims),
