@@ -12,8 +12,9 @@ from acmr.names import terminal
 LONGEST_MESSAGE = 400
 #: Columns of a pipe or a file, where nothing has to fit.
 UNLIMITED = 10_000
-#: What stands before the host of an address; a password that is not quoted may hold a slash.
-_USERINFO = re.compile(r"://([^\s/?#]*|[^\s@]*:[^\s@]*)@")
+#: What stands before the host of an address; a password that is not quoted may hold a slash. Without a scheme it is one
+#: only where there is a password.
+_USERINFO = re.compile(r"(?:(?<=:)//(?:[^\s/?#]*|[^\s@]*:[^\s@]*)|(?<![\w:/.])//[^\s/?#@:]+:[^\s/?#@]+)@")
 #: Where a run's name may be parted: before a setting, but not within a number such as 1e-05.
 _PARTS, _SEPARATORS = re.compile(r"(?=-[A-Za-z]|  |/)"), "- /"
 
@@ -34,7 +35,7 @@ def holds_userinfo(value: object) -> bool:
 
 def without_userinfo(text: str) -> str:
     """A text whose addresses say neither user nor password."""
-    return _USERINFO.sub("://***@", text)
+    return _USERINFO.sub("//***@", text)
 
 
 def one_line(error: BaseException) -> str:

@@ -17,6 +17,7 @@ from tracking_tools import records, spec, start, the_mirror
 from acmr.config import ConfigError
 from acmr.evaluation.cli import main as evaluation
 from acmr.records import description_sha256, portable, portable_settings
+from acmr.settings.command_line import hydra_arguments
 from acmr.settings.compose import compose_config, parse
 from acmr.settings.errors import USER_ERRORS, explain
 from acmr.tracking.mirror import main as mirror
@@ -103,11 +104,35 @@ def test_the_variable_with_a_servers_address_is_looked_at_too(tmp_path, monkeypa
         (["output_dir=${oc.env:PRIVATE}", "tracking.entity=${output_dir}"], "tracking.entity"),
         (["tracking.base_url='http://${oc.env:PRIVATE}/'"], "tracking.base_url"),
         (["pair.source='${oc.env:PRIVATE}'"], "pair.source"),
+        (["device=${oc.env:PRIVATE}"], "device"),
+        (["progress='x${oc.env:PRIVATE}'"], "progress"),
+        (["agent.hidden_sizes=['${oc.env:PRIVATE}']"], "agent.hidden_sizes"),
     ],
 )
 def test_no_setting_that_is_stored_reads_a_variable(overrides, key, monkeypatch):
     monkeypatch.setenv("PRIVATE", SECRET)
     assert f"{key}=${{oc.env:PRIVATE}}: settings are stored with the run" in refused(*overrides)
+
+
+def test_a_number_that_a_variable_holds_is_refused_too(monkeypatch):
+    monkeypatch.setenv("PRIVATE", "4711")
+    for key in ("seed", "total_timesteps", "threshold"):
+        assert f"{key}=${{oc.env:PRIVATE}}: settings are stored" in refused(f"{key}=${{oc.env:PRIVATE}}")
+
+
+@pytest.mark.parametrize(
+    "argument",
+    [
+        "profile=${oc.env:PRIVATE}", "experiment=${oc.env:PRIVATE}", "matrix='${oc.env:PRIVATE}'",
+        f"matrix=https://user:{SECRET}@host", f"https://user:{SECRET}@host=3", f"--config-dir=//user:{SECRET}@host/x",
+        f"env=//user:{SECRET}@host", f"--config-name=x://{SECRET}@host", f"seed=x://u:{SECRET}@h",
+    ],
+)  # fmt: skip
+def test_what_is_wrong_on_a_command_line_is_not_said_with_its_secrets(argument, monkeypatch):
+    monkeypatch.setenv("PRIVATE", SECRET)
+    with pytest.raises(ConfigError) as caught:
+        hydra_arguments([argument])
+    assert SECRET not in str(caught.value)
 
 
 def test_paths_may_begin_where_a_variable_says(monkeypatch, tmp_path):

@@ -16,6 +16,8 @@ from acmr.command import typed
 from acmr.config import ConfigError
 from acmr.settings.compose import CONFIG_FOLDER, PATH_KEYS, as_override, groups, look_in, options
 from acmr.settings.sources import SWEEPS, Sources
+from acmr.settings.validate import NO_USERINFO
+from acmr.text import holds_userinfo, without_userinfo
 
 #: Words of a sweep, and where Hydra keeps them: they are no settings of a run.
 SWEEP_WORDS = {word: f"hydra.sweeper.{word}" for word in ("plan", "retries", "workers")}
@@ -23,6 +25,8 @@ SWEEP_WORDS = {word: f"hydra.sweeper.{word}" for word in ("plan", "retries", "wo
 SEARCH_PATH = "hydra.searchpath"
 #: Names that the student has for what the teacher calls otherwise.
 RENAME = "transfer.rename"
+#: What works something out, from a variable for instance, which an answer would repeat.
+_CALL = re.compile(r"\$\{[^}]*:")
 #: What Hydra reads as another thing than a name.
 _NO_NAME = re.compile(r"null|true|false|[-+]?[0-9.]+", re.IGNORECASE)
 
@@ -33,6 +37,10 @@ def hydra_arguments(given: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: If there are options that Hydra does not have, or a folder is not there.
     """
+    for argument in given:
+        # Here, for whatever is wrong with it would be said with it.
+        if holds_userinfo(argument):
+            raise ConfigError(f"{without_userinfo(argument.partition('=')[0])}: {NO_USERINFO}")
     chosen = _check_options(given)
     searched = [place for argument in given if _is_search_path(argument) for place in _searched(argument)]
     folder = [f"file://{Path(chosen.config_dir).absolute()}"] if chosen.config_dir else []
@@ -62,6 +70,8 @@ def _in_hydras_words(argument: str) -> str:
     if _is_search_path(argument):
         # Added to the places that the project needs, where Hydra would put others in their place.
         return f"{SEARCH_PATH}={as_override([*dict.fromkeys([*_searched(argument), SWEEPS])])}"
+    if _CALL.search(value) and key.lstrip("+") in groups():
+        raise ConfigError(f"{key}={value}: is chosen by its name; type one of {', '.join(options(key.lstrip('+')))}")
     if _NO_NAME.fullmatch(value) and key in groups():
         raise ConfigError(f"{key}={value}: must be one of {', '.join(options(key))}, or left out")
     return argument

@@ -28,7 +28,7 @@ from acmr.records import MOST_SEED
 from acmr.text import holds_userinfo
 
 #: Settings are stored with the run.
-_NO_USERINFO = (
+NO_USERINFO = (
     "an address with a user or a password, which would be stored with the run; leave them out "
     "(a W&B server's key is read from WANDB_API_KEY)"
 )
@@ -83,7 +83,7 @@ def validate(config: ExperimentConfig) -> None:
     check_address("tracking.base_url", config.tracking.base_url)
     for key, value in flatten(asdict(config)).items():
         if holds_userinfo(value):
-            raise ConfigError(f"{key}: {_NO_USERINFO}")
+            raise ConfigError(f"{key}: {NO_USERINFO}")
     _check_transfer(config)
     _check_stop(config)
 
@@ -103,7 +103,7 @@ def check_address(key: str, value: str | None) -> None:
     if value == "":
         raise ConfigError(f"tracking=self_hosted needs the server's address: type {key}=http://HOST:PORT")
     if "@" in value:
-        raise ConfigError(f"{key}: {_NO_USERINFO}")
+        raise ConfigError(f"{key}: {NO_USERINFO}")
     if not re.fullmatch(r"https?://[^\s/?#]+(/[^\s?#]*)?", value):
         raise ConfigError(f"{key}: the address of a server is needed, and nothing else, as in http://HOST:PORT")
 

@@ -45,8 +45,10 @@ def refuse_variables(cfg: DictConfig, allowed: tuple[str, ...]) -> None:
 def _settings(cfg: DictConfig) -> Iterator[str]:
     """Every setting, as ``group.key``, after it has been worked out."""
     for group in map(str, cfg):
-        is_group = not OmegaConf.is_interpolation(cfg, group) and isinstance(_worked_out(cfg, group), DictConfig)
-        if not is_group:
+        value = _worked_out(cfg, group)
+        if OmegaConf.is_interpolation(cfg, group) or not isinstance(value, DictConfig):
+            if OmegaConf.is_config(value):
+                _all_of(value)
             yield group
             continue
         for key in map(str, cfg[group]):
