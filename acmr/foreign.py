@@ -56,6 +56,19 @@ def is_there(path: Path) -> bool:
         return False
 
 
+def is_file(path: Path) -> bool:
+    """Whether a path leads to a regular file, as far as one may see: in a folder that is locked there is none."""
+    return os.path.isfile(path)
+
+
+def real_path(path: Path) -> Path:
+    """Where a path leads, as far as one may see: a link that cannot be read leads to itself."""
+    try:
+        return Path(os.path.realpath(path))
+    except OSError:
+        return path.absolute()
+
+
 @contextmanager
 def opened(path: Path, title: str = "", links: bool = True) -> Iterator[tuple[BinaryIO, int]]:
     """Opens a regular file to read it; its size in bytes comes with it.

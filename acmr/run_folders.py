@@ -8,6 +8,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
+import math
 import os
 import zlib
 from collections.abc import Mapping
@@ -29,6 +30,8 @@ from acmr.records import (
 
 #: Folders that hold other files of the same names (of W&B, Python); those whose name begins with a dot are, too.
 PASSED_OVER = ("wandb", "__pycache__")
+#: Folders that are looked into behind one link; no more, should it lead to a whole disk.
+_MOST_BEHIND = 20_000
 #: Files by which a directory of any name is known to hold a run.
 _SIGNS = {*EPISODE_FILES, SUMMARY_FILE}
 
@@ -53,7 +56,8 @@ def run_folders(root: Path) -> list[RunFolder]:
 
     A run's directory is called ``seed_<n>`` or holds episodes or a summary; no run is looked for within a ``seed_<n>``.
     Symbolic links are followed, the root's own included. A link that leads nowhere, and a folder that cannot be read,
-    are listed with their problem, for there may be runs behind them.
+    are listed with their problem, for there may be runs behind them; so is one that leads to more than
+    any folder of runs. A link to a folder that it lies in itself is no way to anything.
 
     Args:
         root: The folder; may itself be a run's directory.
@@ -109,10 +113,16 @@ class _Search:
         self.links: list[Path] = []
         self._seen: dict[tuple[int, int], Path] = {}
 
-    def look_into(self, top: Path) -> None:
+    def look_into(self, top: Path, most: float = math.inf) -> None:
         """Finds the runs in a folder and below it; links are noted."""
-        waiting = [top]
+        waiting, looked = [top], 0
         while waiting:
+            looked += 1
+            if looked > most:
+                self.found[top] = RunFolder(
+                    top, f"more than {most:,} folders behind this link; not all were looked into"
+                )
+                return
             folder = waiting.pop()
             try:
                 waiting += self._look_at(folder)
@@ -124,11 +134,15 @@ class _Search:
         try:
             first = self._seen.get(_identity(link))
         except OSError as error:
-            reason = f"the link leads nowhere: {os.readlink(link)} ({error.strerror})"
-            self.found[link] = RunFolder(link, reason)
+            target = "it cannot be read"
+            with suppress(OSError):
+                target = os.readlink(link)
+            self.found[link] = RunFolder(link, f"the link leads nowhere: {target} ({error.strerror})")
             return
         if first is None:
-            self.look_into(link)
+            # The root of all disks, a home: it holds the link itself and everything else.
+            if not Path(os.path.realpath(link.parent)).is_relative_to(os.path.realpath(link)):
+                self.look_into(link, _MOST_BEHIND)
             return
         # A link to a folder that it lies in itself is no way to anything.
         if not link.is_relative_to(first):

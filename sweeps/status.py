@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from acmr.command import command, typed
+from acmr.foreign import is_file
 from acmr.names import terminal
 from acmr.records import CONFIG_FILE, FAILED, RUNNING, SEED_FOLDER, STATUS_FILE
 from acmr.run_folders import RunFolder, run_folders
@@ -57,7 +58,7 @@ def _state(folder: SweepFolder, entry: SweepRun, alive: bool) -> State:
 
 def _is_ours(folder: RunFolder) -> bool:
     """Whether a folder was written by a run: episodes alone may come from anywhere."""
-    return any((folder.path / name).is_file() for name in (CONFIG_FILE, STATUS_FILE))
+    return any(is_file(folder.path / name) for name in (CONFIG_FILE, STATUS_FILE))
 
 
 def _name(output_dir: Path, directory: Path) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
+import traceback
 from pathlib import Path
 
 import pytest
@@ -144,14 +146,33 @@ def test_a_link_that_leads_nowhere_is_listed(root, capsys, link):
     assert ("leads nowhere" in capsys.readouterr().out) == (not link.endswith(".csv"))
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read every folder")
-def test_a_folder_that_cannot_be_read_is_listed(root):
-    (root / "A2" / "seed_1").mkdir(parents=True)
-    (root / "A2").chmod(0)
-    try:
-        assert load(root).runs.loc["A2", "reason"].startswith("cannot be read: Permission denied")
-    finally:
-        (root / "A2").chmod(0o755)
+@pytest.mark.parametrize("locked", ["A2", "A2/seed_1"])
+def test_a_folder_that_cannot_be_read_is_listed(locked):
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "paper"
+        write_run(root, "A0", 1, ROWS, total=20_000)
+        write_run(root / "A2", "A0", 1, ROWS, total=20_000).rename(root / "A2" / "seed_1")
+        Path(folder).chmod(0o755)
+        # All that is loaded late, for the user below may not read Python itself.
+        assert main([str(root), "--summary"]) == 0
+        (root / locked).chmod(0)
+        child = os.fork()
+        if not child:
+            try:
+                # Root may read every folder.
+                if os.geteuid() == 0:
+                    os.setuid(65534)
+                runs = load(root).runs
+                assert runs.loc[locked, "reason"].startswith("cannot be read: Permission denied")
+                assert runs.loc[f"{NAME}/seed_1", "counted"]
+                assert status([str(root)]) == 0
+                assert main([str(root), "--summary"]) == 0
+                os._exit(0)
+            except BaseException:
+                traceback.print_exc()
+                os._exit(1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        (root / locked).chmod(0o755)
 
 
 def test_files_beside_the_seeds_hide_none_of_them(root):
@@ -197,3 +218,29 @@ def test_every_run_that_does_not_count_is_named_where_it_is_no_cell(root, capsys
     said = capsys.readouterr().out
     for name in ("mine", "yours"):
         assert f"not used: {name}/seed_1 (unfinished): no episodes.csv; no summary.json" in said
+
+
+@pytest.mark.parametrize("target", ["/", "..", "../.."])
+def test_a_link_to_what_it_lies_in_is_not_followed(target, root):
+    before = run_folders(root)
+    (root / "all").symlink_to(target)
+    (root.parent / "elsewhere-run" / "seed_9").mkdir(parents=True)
+    assert run_folders(root) == before
+
+
+def test_a_link_to_a_whole_disk_is_said_and_left(root, tmp_path, monkeypatch):
+    monkeypatch.setattr("acmr.run_folders._MOST_BEHIND", 50)
+    for number in range(60):
+        (tmp_path / "disk" / str(number)).mkdir(parents=True)
+    before = run_folders(root)
+    (root / "disk").symlink_to(tmp_path / "disk")
+    (found,) = [folder for folder in run_folders(root) if folder not in before]
+    assert found.problem == "more than 50 folders behind this link; not all were looked into"
+
+
+def test_links_of_processes_stop_nothing(root, capsys):
+    """Where a link can be seen but not be read, as those of other users' processes and, here, of the first."""
+    (root / "processes").symlink_to("/proc/1")
+    assert "seed_1" in [folder.path.name for folder in run_folders(root) if not folder.problem]
+    assert status([str(root)]) in (0, 1)
+    assert "Traceback" not in capsys.readouterr().err

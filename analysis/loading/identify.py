@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from acmr.cells import CELLS, SOURCE, Cell, full_name, run_name
 from acmr.config import flatten
+from acmr.foreign import real_path
 from acmr.records import SEED_FOLDER
 from analysis.loading.values import MOST_SEED
 
@@ -61,9 +61,7 @@ def identify(directory: Path, name: str, config: Mapping[str, Any], summary: Map
     else:
         cell = dict(_names()).get(full_name(name).lower())
     # A link may have any name; what it leads to tells the seed.
-    match = SEED_FOLDER.fullmatch(directory.name) or SEED_FOLDER.fullmatch(
-        os.path.basename(os.path.realpath(directory))
-    )
+    match = SEED_FOLDER.fullmatch(directory.name) or SEED_FOLDER.fullmatch(real_path(directory).name)
     said = (summary.get("seed"), settings.get("seed"), int(match[1]) if match else None)
     seed = next((value for value in said if isinstance(value, int) and not isinstance(value, bool)), None)
     return Identity(

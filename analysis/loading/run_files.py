@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from acmr.config import flatten
+from acmr.foreign import is_file
 from acmr.records import CONFIG_FILE, EPISODES_FILE, FILES_ENTRY, METRICS_FILE, STATUS_FILE, SUMMARY_FILE, DamagedError
 from acmr.run_folders import changes
 from analysis.loading.values import check_numbers, read_mapping
@@ -50,7 +51,7 @@ class RunFiles:
 
 def read_files(directory: Path) -> RunFiles:
     """Reads the settings and the summary of a run, and sees whether they are what the run left."""
-    found = RunFiles(begun=any((directory / name).is_file() for name in (CONFIG_FILE, STATUS_FILE)))
+    found = RunFiles(begun=any(is_file(directory / name) for name in (CONFIG_FILE, STATUS_FILE)))
     said = _read(directory / SUMMARY_FILE, found.problems)
     found.own = found.begun or FILES_ENTRY in said or said.keys() >= _OWN_ENTRIES
     changed = changes(directory, said)

@@ -14,6 +14,7 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup
 
+from acmr.foreign import is_file, real_path
 from acmr.names import link, terminal
 from acmr.records import CONFIG_FILE, EPISODE_FILES, LOG_FILE, SUMMARY_FILE
 from analysis.analyze import Analysis
@@ -170,7 +171,7 @@ def _runs(analysis: Analysis, out: Path) -> list[dict[str, Any]]:
     rows = []
     for name, run in analysis.measured.iterrows():
         directory = analysis.data.root / run["directory"]
-        links = [(file, _relative(directory / file, out)) for file in RUN_FILES if (directory / file).is_file()]
+        links = [(file, _relative(directory / file, out)) for file in RUN_FILES if is_file(directory / file)]
         rows.append(
             {
                 "run": str(name),
@@ -198,4 +199,4 @@ def _known(value: float) -> float | None:
 
 def _relative(path: Path, out: Path) -> str:
     # Else a folder that is called "javascript:..." or "https:..." would be another kind of address.
-    return f"./{link(Path(os.path.relpath(path.resolve(), out.resolve())))}"
+    return f"./{link(Path(os.path.relpath(real_path(path), real_path(out))))}"
