@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 from analysis_runs import rows_reaching, run_directory, seal, write_run
 
 from acmr.run_folders import changes
+from analysis.evaluations import adds_up
 from analysis.loading.load import load
 from analysis.publish import PublishError, _resealed, publish
 
@@ -125,3 +127,21 @@ def test_a_changed_run_is_not_published(name, runs, tmp_path):
     with pytest.raises(PublishError, match=f"{folder}: {name} was changed since"):
         publish(runs, tmp_path / "results")
     assert not (tmp_path / "results").exists()
+
+
+def test_every_changed_digit_of_an_evaluation_is_found():
+    files = sorted((Path(__file__).parents[1] / "results").rglob("evaluation.json"))
+    assert len(files) > 20
+    for path in files:
+        assert adds_up(json.loads(path.read_text())), path
+    text = files[0].read_text()
+    missed = []
+    # The last digits of a sum are no other number.
+    for match in re.finditer(r"(?<=: )-?\d[\d.]*", text):
+        for place in range(match.start(), min(match.end(), match.start() + 10)):
+            if text[place].isdigit():
+                changed = text[:place] + ("7" if text[place] != "7" else "3") + text[place + 1 :]
+                content = json.loads(changed) if not re.search(r": -?0\d", changed) else {}
+                if adds_up(content):
+                    missed.append(text[match.start() - 30 : match.end()])
+    assert missed == []
