@@ -272,6 +272,21 @@ def test_sync_that_cannot_be_done_says_why_in_one_line(
         assert words in line
 
 
+@pytest.mark.parametrize("place", ["config/settings", "wandb/settings"])
+def test_settings_in_a_folder_of_mirrors_do_not_steer_wandb(place: str, tmp_path: Path, server: Server) -> None:
+    file = tmp_path / "wandb" / ".home" / place
+    file.parent.mkdir(parents=True)
+    nowhere = closed_port()
+    file.write_text(f"[default]\nproject = theirs\nhttp_proxy = {nowhere}\nhttps_proxy = {nowhere}\n")
+    warnings: list[str] = []
+    tracker = start(tmp_path, warnings)
+    expected = log(tracker, 3)
+    tracker.close(None)
+    assert sync(tmp_path / "wandb", server.url) == 1
+    assert server.history(ID) == expected
+    assert warnings == []
+
+
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/etc/hostname")], ids=["pipe", "link"])
 def test_sync_sends_nothing_that_lies_elsewhere(make: Callable[[Path], None], tmp_path: Path, server: Server) -> None:
     mirror = tmp_path / "wandb" / "offline-run-20261126_113255-sent"

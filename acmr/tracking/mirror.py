@@ -9,6 +9,7 @@ import argparse
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -92,10 +93,12 @@ def sync(folder: Path, base_url: str) -> int:
         raise ConfigError(f"{len(files)} runs wait in {folder}, but {problem}")
     foreign = {key: value for key, value in os.environ.items() if not key.startswith("WANDB_")}
     variables = {**foreign, **wandb_environment(folder.absolute()), "WANDB_BASE_URL": base_url}
-    variables["WANDB_DIR"] = _log_folder(folder)
     del variables["WANDB_SILENT"]
     command = [sys.executable, "-m", "wandb", "sync", "--yes", "--include-online", "--include-synced"]
-    subprocess.run([*command, *(str(file.parent) for file in files)], env=variables, check=False)
+    # In its own folder W&B would look for settings, too.
+    with tempfile.TemporaryDirectory() as logs:
+        given = [*command, *(str(file.parent) for file in files)]
+        subprocess.run(given, env=variables | {"WANDB_DIR": logs}, check=False)
     missing = [file for file in files if not _is_sent(file)]
     if missing:
         raise ConfigError(

@@ -129,7 +129,9 @@ def wandb_environment(folder: Path) -> dict[str, str]:
     """The W&B variables of a run or of a ``wandb`` command: the user's key, nothing in the home folder, no reports."""
     kept = {key: value for key, value in os.environ.items() if key in _KEPT_VARIABLES}
     home = folder / ".home"
-    places = {f"WANDB_{kind.upper()}_DIR": str(home / kind) for kind in ("data", "cache", "config")}
+    places = {f"WANDB_{kind.upper()}_DIR": str(home / kind) for kind in ("data", "cache")}
+    # No settings of W&B's own: a folder of mirrors may be somebody else's, and they can lead the key to another server.
+    places["WANDB_CONFIG_DIR"] = os.path.join(os.devnull, "none")
     return {**kept, **places, "WANDB_ERROR_REPORTING": "false", "WANDB_SILENT": "true"}
 
 
