@@ -142,6 +142,22 @@ def test_a_run_that_loses_its_directory_stops_in_one_line(lose, tmp_path):
         assert there == {"": None}
 
 
+def test_a_directory_that_goes_while_a_checkpoint_is_made_is_told_like_any_other_time(tmp_path):
+    def remove_before_pruning() -> None:
+        from acmr.storage.checkpoint_store import SnapshotStore
+
+        prune = SnapshotStore.prune
+
+        def gone(store, files) -> None:
+            shutil.rmtree(store.folder.parent)
+            prune(store, files)
+
+        SnapshotStore.prune = gone
+
+    ended = Run(tmp_path, ANT)(remove_before_pruning)
+    assert (ended.code, "removed or replaced" in ended.said) == (74, True), ended.said
+
+
 def test_a_run_begun_anew_is_not_disturbed_by_the_old_process(untouched, tmp_path):
     run, go_on = Run(tmp_path, ANT), tmp_path / "go on"
 

@@ -33,6 +33,7 @@ from acmr.storage.durable import (
     sync_folder,
     write_bytes,
 )
+from acmr.storage.hold import check_hold
 from acmr.text import size
 
 #: Changes with what a checkpoint holds and where; another one is refused.
@@ -150,7 +151,12 @@ class SnapshotStore:
                 self.discard(step)
         kept = {name for names in files.values() for name in names}
         kept |= {path.name for step in files for path in (self.state_file(step), self._arrays_file(step))}
-        for path in sorted(self.folder.iterdir()):
+        try:
+            there = sorted(self.folder.iterdir())
+        except FileNotFoundError:
+            check_hold(self.folder)  # which says so where the run's whole directory is gone
+            raise
+        for path in there:
             if _OURS.fullmatch(path.name) and path.name not in kept:
                 remove(path)
 
