@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,16 @@ TEACHER = PUBLISHED / "humanoid-none" / "seed_1"
 RUNS = sorted(path.parent for path in PUBLISHED.glob("*/*/summary.json"))
 
 
+@cache
+def cells() -> dict[str, str]:
+    """Which cell each run is of, as the analysis sees it."""
+    return load(PUBLISHED).runs["cell"].to_dict()
+
+
 def summary_of(run: Path) -> dict:
-    return json.loads((run / "summary.json").read_text())
+    """Its summary, with the cell that its settings make it now: N2 was run before it was a cell."""
+    summary = json.loads((run / "summary.json").read_text())
+    return summary | {"cell": summary["cell"] or cells()[run.relative_to(PUBLISHED).as_posix()]}
 
 
 def test_they_are_analyzed_without_a_remark():
