@@ -43,7 +43,7 @@ def make_run(path: Path, core: Dimensions | None = None, width: int = 32) -> Pat
         observation_names=list(about.observation_names), action_names=list(about.action_names),
         action_low=low.tolist(), action_high=high.tolist(), hidden_sizes=[width, width],
         core=[core.observation, core.action] if core else None, adapter_activation="relu", log_alpha=0.0, seed=1,
-        profile="quick", global_step=100, final_return=None, config={},
+        profile="quick", global_step=100, final_return=None, config={"env": asdict(ANT), "seed": 1},
     )  # fmt: skip
     save_teacher(path, networks, description)
     (path / "config.yaml").write_text(yaml.safe_dump({"env": asdict(ANT), "seed": 1}))

@@ -55,6 +55,16 @@ def test_returns_are_those_of_an_independent_calculation(run: Path, capsys: pyte
     assert [line.split()[0] for line in printed.out.splitlines()] == ["episode"] * 3 + ["mean", "written:"]
 
 
+def test_a_teacher_alone_is_evaluated_by_its_folder_or_its_file(run: Path) -> None:
+    assert main([str(run), "--episodes", "2"]) == 0
+    whole = result(run)
+    for name in ("config.yaml", "summary.json", "evaluation.json"):
+        (run / name).unlink()
+    for given in (run, run / "teacher.safetensors"):
+        assert main([str(given), "--episodes", "2"]) == 0
+        assert result(run)["each"] == whole["each"]
+
+
 def test_an_episode_does_not_depend_on_those_before_it(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "new folder" / "e.json"
 

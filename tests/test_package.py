@@ -119,6 +119,9 @@ def test_a_training_a_sweep_and_an_analysis_anywhere(installed, user):
     assert "3 observations, 1 actions" in run("envs", "my_robots:Swing-v0").stdout
     (played,) = (user / "runs" / "quick").glob("ant-none-*/seed_1")
     assert "mean" in run("evaluate", str(played.relative_to(user)), "--episodes", "1").stdout
+    code = f"import acmr; print(acmr.load({str(played)!r}).names.actions, len(acmr.results('runs/quick').runs))"
+    told = subprocess.run([installed / "bin" / "python", "-P", "-c", code], cwd=user, capture_output=True, text=True)
+    assert told.stdout.startswith("('hip_4', "), told.stderr
     assert sorted(path.name for path in user.iterdir()) == ["analysis", "my_robots.py", "own", "results", "runs"]
 
 

@@ -18,40 +18,60 @@ from acmr.config import ConfigError, EnvConfig
 from acmr.evaluation.camera import is_robot, make_camera
 from acmr.evaluation.rollout import MOST_STEPS, Episode, VideoOptions, play, render_mode
 from acmr.evaluation.zero_shot import policy_in
+from acmr.foreign import is_there
 from acmr.names import terminal
-from acmr.records import CONFIG_FILE, EVALUATION_FILE, portable
+from acmr.records import CONFIG_FILE, DESCRIPTION_FILE, EVALUATION_FILE, portable
 from acmr.settings.compose import environment_config
 from acmr.settings.stored import stored_environment
 from acmr.storage.durable import WriteError
 from acmr.storage.json_files import write_json
 from acmr.storage.run_dir import RunDir
-from acmr.transfer.teacher import Teacher, load_teacher
+from acmr.transfer.teacher import Teacher, load_teacher, locate_teacher
 
 #: Where a still is seen from, in degrees, and how close, relative to the camera that follows a robot.
 _STILL_AZIMUTH, _STILL_CLOSENESS = 150.0, 0.85
 
 
-def load_run(path: Path, trust: bool = False) -> tuple[Teacher, EnvConfig]:
-    """The final networks of a finished run, and the environment they learned in.
+def load_policy(path: Path) -> tuple[Teacher, object, Path]:
+    """The final networks of a finished run, or those of a teacher alone, in whatever folder its two files lie.
 
-    Args:
-        path: Its directory.
-        trust: Whether its files may choose code to run.
+    Returns:
+        The networks, the settings they learned with, and the file which says so.
 
     Raises:
-        ConfigError: If there is no such run, if it is unfinished, if one of its files is damaged, or chooses code.
+        ConfigError: If there is no such run, if it is unfinished, or if one of its files is damaged.
     """
     run_dir = RunDir(path)
+    if path.is_file():
+        teacher = load_teacher(path)
+        return teacher, teacher.description.config, path.with_suffix(".json")
     if not path.is_dir():
         raise ConfigError(f"{path}: no such run directory; give one as in runs/quick/ant-none/seed_1")
     run_dir.check_unchanged()
     settings = run_dir.stored_settings()
+    # A run that has lost its settings is damaged, and no teacher.
+    if settings is None and run_dir.summary() is None and is_there(locate_teacher(path)):
+        teacher = load_teacher(path)
+        return teacher, teacher.description.config, path / DESCRIPTION_FILE
     if settings is None:
         raise ConfigError(f"{path}: not a run directory (no {CONFIG_FILE}); give one as in runs/quick/ant-none/seed_1")
     if not run_dir.is_complete():
         raise ConfigError(f"{path}: this run is not finished; start it again with the command that began it")
-    config = stored_environment(settings, run_dir.config_file, "type --trust", trust)
-    return load_teacher(path), config
+    return load_teacher(path), settings, run_dir.config_file
+
+
+def load_run(path: Path, trust: bool = False) -> tuple[Teacher, EnvConfig]:
+    """The final networks of a finished run or a teacher, and the environment they learned in.
+
+    Args:
+        path: Its directory, or the file of the teacher.
+        trust: Whether its files may choose code to run.
+
+    Raises:
+        ConfigError: As :func:`load_policy`; or if one of the files chooses code.
+    """
+    teacher, settings, file = load_policy(path)
+    return teacher, stored_environment(settings, file, "type --trust", trust)
 
 
 def check_fit(teacher: Teacher, config: EnvConfig) -> str | None:
@@ -114,7 +134,8 @@ def evaluate(given: argparse.Namespace) -> None:
         config = own if name is None else environment_config(name)
         remark, actor = _policy(teacher, config, given, is_own=name is None)
         contents.append(_evaluate_in(config, actor, remark, teacher, given))
-        _store(contents[-1], given.out or given.run_dir / _file_name(config, is_own=name is None))
+        file = locate_teacher(given.run_dir).with_name(_file_name(config, is_own=name is None))
+        _store(contents[-1], given.out or file)
     if len(contents) > 1:
         width = max(len(content["environment"]) for content in contents)
         print(f"{'body':<{width}}  {'mean':>10}  {'least':>10}  {'most':>10}  {'length':>7}")
