@@ -19,7 +19,6 @@ NEUTRAL_KEYS = (
 
 #: Settings that a teacher must share with its student: its length and the shape of its networks.
 TEACHER_KEYS = ("total_timesteps", "agent.hidden_sizes")
-
 #: Choose the teacher, of which ``transfer.json`` has the hash.
 TEACHER_CHOICE = ("transfer.teacher", "transfer.teacher_seeds")
 
@@ -160,6 +159,8 @@ class TransferConfig:
 
     #: The method, a file in ``conf/transfer``; by default nothing is taken.
     name: str = "none"
+    #: The function that does it, ``module:name``; None: the one of the method's name in ``acmr/transfer``.
+    method: str | None = None
     rules: TransferRules = field(default_factory=TransferRules)
     #: Path of a teacher file or of a finished run; None: the run of the source environment with the same seed.
     teacher: str | None = None
@@ -291,10 +292,9 @@ def differing_keys(stored: Mapping[str, Any], config: ExperimentConfig) -> list[
     done any more, so it counts as a difference, unless it was null: not set.
     """
     before, now = schema_defaults() | flatten(stored), flatten(plain_settings(config))
-    keys = sorted(set(before) | set(now))
     return [
         key
-        for key in keys
+        for key in sorted(set(before) | set(now))
         # One teacher may be reached in several ways; the run's name identifies it by its content.
         if not is_neutral(key) and key not in TEACHER_CHOICE and before.get(key) != now.get(key)
     ]

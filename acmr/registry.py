@@ -1,4 +1,4 @@
-"""Names in the settings and what they stand for: a learner, a transfer method."""
+"""Names in the settings and what they stand for: a learner, a transfer method, something in a module of the user's."""
 
 from __future__ import annotations
 
@@ -8,9 +8,42 @@ from importlib.util import find_spec
 from typing import Any, Generic, TypeVar, cast
 
 from acmr.config import ConfigError
+from acmr.text import one_line
 
 _Kind = TypeVar("_Kind")
 _Entry = TypeVar("_Entry")
+
+
+def named_in(key: str, place: str) -> Any:
+    """What ``module:name`` stands for; the module is imported.
+
+    Args:
+        key: The setting that holds it, for the message.
+        place: Such as ``my_methods:values``: in a file of the current folder, or installed.
+
+    Raises:
+        ConfigError: If there is nothing there.
+    """
+    module, _, name = place.partition(":")
+    if not all(part.isidentifier() for part in [*module.split("."), name]):
+        raise ConfigError(f"{key}={place}: MODULE:NAME is needed, as in {key}=my_methods:values")
+    try:
+        found = import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is not None and f"{module}.".startswith(f"{error.name}."):
+            raise ConfigError(
+                f"{key}={place}: there is no module {error.name}; it is looked for in the current folder, "
+                "and among what is installed"
+            ) from error
+        raise ConfigError(f"{key}={place}: {module} cannot be imported ({one_line(error)})") from error
+    except Exception as error:
+        # The user's own code, whatever it does.
+        raise ConfigError(f"{key}={place}: {module} cannot be imported ({one_line(error)})") from error
+    if not hasattr(found, name):
+        own = [known for known, value in vars(found).items() if getattr(value, "__module__", None) == module]
+        hint = f"; there are {', '.join(own)}" if own else ""
+        raise ConfigError(f"{key}={place}: {module} has no {name}{hint}")
+    return getattr(found, name)
 
 
 class Registry(Generic[_Kind]):

@@ -105,9 +105,12 @@ def test_a_training_a_sweep_and_an_analysis_anywhere(installed, user):
     # What is printed can be typed here: there is no run.py.
     refused = run("transfer=hidden", *TINY, code=2).stderr
     assert refused.count("\n") == 1
-    printed = re.search(r"train it with: acmr (.*) \(or give", refused)[1]
-    assert "complete" in run(*shlex.split(printed), "tracking=off", "progress=off").stdout
+    printed = re.search(r"train it with: acmr (.*) \(or both, one after the other: acmr (.*);", refused)
+    assert printed is not None
+    assert "complete" in run(*shlex.split(printed[1]), "tracking=off", "progress=off").stdout
     assert "complete" in run("train", "transfer=hidden", *TINY).stdout
+    # The student and its teacher are there by now.
+    assert "1 of 1 runs complete" in run(*shlex.split(printed[2])).stdout
     swept = run("-m", "transfer=hidden,expand", "seed=1,2", *TINY).stdout
     assert "5 of 5 runs complete: runs/quick" in swept
     # The teacher and the student of seed 1 were there before, and are the same runs.

@@ -84,7 +84,7 @@ def test_a_single_run_finds_them_and_prints_a_command_that_does(way: str, own: P
     done = run(own.parent, *shlex.split(way.format(own=own)), *SINGLE)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
-    printed = shlex.split(done.stderr.partition("train it with: python run.py ")[2].partition(" (or give")[0])
+    printed = shlex.split(done.stderr.partition("train it with: python run.py ")[2].partition(" (or both")[0])
     # As it stands, from anywhere; --cfg shows what Hydra makes of it and trains nothing.
     shown = run(own, "--cfg", "job", *printed)
     assert shown.returncode == 0, shown.stderr

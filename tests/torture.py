@@ -59,7 +59,7 @@ def found_out(overrides: tuple[str, ...]) -> Prepared:
     """What a run finds out of its settings before it touches the disk, found out once."""
     made = spec(Path("unused"), *overrides)
     # Whoever edits the program while these tests run does not change it for them.
-    reproducibility._program()
+    reproducibility._program(("acmr.agent.sac",))
     return prepare(made)
 
 

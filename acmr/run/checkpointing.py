@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from acmr.config import INEXACT, TEACHER_CHOICE, ConfigError, flatten, is_neutral, schema_defaults
+from acmr.config import INEXACT, TEACHER_CHOICE, ConfigError, ExperimentConfig, flatten, is_neutral, schema_defaults
 from acmr.envs.state import ANYTIME, NEVER
 from acmr.records import DamagedError
 from acmr.run.preparation import Prepared
@@ -195,12 +195,20 @@ def _key(prepared: Prepared) -> CheckpointKey:
     }
     # One teacher may be reached by several paths; its hash says which it is.
     teacher = {**(report["teacher"] or {}), "path": None}
+    made_with = _chosen(spec.config)
     return CheckpointKey(
         run={"settings": settings, "transfer": {**report, "teacher": teacher}},
-        fingerprint=fingerprint(spec.config.threads, spec.config.device, prepared.resume_check.trace),
+        fingerprint=fingerprint(spec.config.threads, spec.config.device, prepared.resume_check.trace, made_with),
         command=lambda: spec.command,
         mode=spec.config.resume,
     )
+
+
+def _chosen(config: ExperimentConfig) -> tuple[str, ...]:
+    """Modules that the settings name, whether or not there are such: of the learner and of the transfer method."""
+    agent, transfer = config.agent, config.transfer
+    own = transfer.method.partition(":")[0] if transfer.method else f"acmr.transfer.{transfer.name}"
+    return f"acmr.agent.{agent.name}", own
 
 
 class CheckpointSchedule(Observer):

@@ -20,7 +20,7 @@ from acmr.settings.run_spec import RunSpec
 from acmr.tracking.watchers import tracker_class
 from acmr.transfer.audition import Audition
 from acmr.transfer.find import find_teacher
-from acmr.transfer.methods import Student, transfer
+from acmr.transfer.methods import Student, find_method, transfer
 from acmr.transfer.report import TransferReport
 
 
@@ -63,6 +63,8 @@ def prepare(spec: RunSpec) -> Prepared:
     _check_device(config.device)
     tracker_class(config.tracking)
     learner = find_learner(config.agent)
+    # A name that stands for nothing is no reason to look for a teacher.
+    find_method(config.transfer)
     # Before anything else asks for the environment: one of its instances is then tried out for all of them.
     resume_check = check_resume(config.env)
     about = describe(config.env)

@@ -5,12 +5,14 @@ A run goes on exactly only where all of it is as it was.
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import platform
 import subprocess
 from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from types import CodeType
 
@@ -21,14 +23,17 @@ import torch
 _REPORTED_LIBRARIES = ("acmr", "torch", "numpy", "gymnasium", "mujoco", "hydra-core", "omegaconf", "wandb")
 #: Those of them whose change changes results.
 _LIBRARIES = ("python", "torch", "numpy", "gymnasium", "mujoco")
-#: Packages of this program that only name, show or send a run; every other one may decide what it computes.
+#: Where a run begins, and the package that it is of.
+_ROOT, _OURS = "acmr.run.experiment", "acmr"
+#: Packages of it that only name, show or send a run; every other one may decide what it computes.
 _ASIDE = frozenset(("settings", "tracking", "evaluation"))
 
 
-def fingerprint(threads: int, device: str, environment_trace: bytes) -> dict[str, str]:
+def fingerprint(threads: int, device: str, environment_trace: bytes, chosen: tuple[str, ...] = ()) -> dict[str, str]:
     """Everything that must be the same for a run to go on exactly, by name.
 
     Args:
+        chosen: Modules that only the settings name: the learner's, the transfer method's.
         threads: Threads that the learner computes with.
         device: Where it computes.
         environment_trace: What the environment returned while its resuming was checked.
@@ -45,7 +50,7 @@ def fingerprint(threads: int, device: str, environment_trace: bytes) -> dict[str
         "matrix products": f"{torch.backends.cpu.get_cpu_capability()} {torch.get_float32_matmul_precision()}",
         "sample of computations": _digest(_computations()),
         "sample of the environment": _digest(environment_trace),
-        "program": _digest(_program()),
+        "program": _digest(_program(chosen)),
     }
 
 
@@ -87,13 +92,47 @@ def _computations() -> bytes:
     return b"".join(result.numpy().tobytes() for result in results) + alone.tobytes() + np.tanh(alone).tobytes()
 
 
+def _program(chosen: tuple[str, ...]) -> bytes:
+    """What the sources that decide results compile to, without comments, docstrings and positions.
+
+    Only those in use: what the run imports, and what its settings choose. So a method that is added voids no checkpoint
+    of runs that know nothing of it.
+    """
+    waiting, found = [_ROOT, *chosen], dict[str, str]()
+    while waiting:
+        name = waiting.pop()
+        if name in found or _ASIDE.intersection(name.split(".")[1:2]):
+            continue
+        file = _file_of(name)
+        if file is not None:
+            imported, found[name] = _source(file)
+            waiting += [module for module in imported if module.split(".")[0] == _OURS]
+    return "\n".join(f"{name} {meaning}" for name, meaning in sorted(found.items())).encode()
+
+
+def _file_of(module: str) -> Path | None:
+    """The source of a module; None where there is none, as for a name that a module merely holds."""
+    if module.split(".")[0] != _OURS:
+        # In a folder of the user's, or installed.
+        spec = find_spec(module)
+        return Path(spec.origin) if spec is not None and spec.has_location and spec.origin else None
+    place = Path(__file__).resolve().parents[1].joinpath(*module.split(".")[1:])
+    files = (place / "__init__.py", place.with_suffix(".py"))
+    return next((file for file in files if file.is_file()), None)
+
+
 @cache
-def _program() -> bytes:
-    """What the sources that decide results compile to, without comments, docstrings and positions."""
-    folder = Path(__file__).resolve().parents[1]
-    paths = sorted(path for path in folder.rglob("*.py") if path.relative_to(folder).parts[0] not in _ASIDE)
-    codes = [compile(path.read_bytes(), path.name, "exec", optimize=2, dont_inherit=True) for path in paths]
-    return "\n".join(f"{path.name} {_meaning(code)}" for path, code in zip(paths, codes, strict=True)).encode()
+def _source(file: Path) -> tuple[list[str], str]:
+    """The modules that a file may import, with the packages they lie in, and what it compiles to."""
+    tree = ast.parse(file.read_bytes())
+    names = set[str]()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    within = {name.rsplit(".", depth)[0] for name in names for depth in range(name.count(".") + 1)}
+    return sorted(within), _meaning(compile(tree, file.name, "exec", optimize=2, dont_inherit=True))
 
 
 def _meaning(code: CodeType) -> str:

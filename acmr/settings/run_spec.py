@@ -63,6 +63,11 @@ class RunSpec:
         """The shortest command line that makes this run."""
         return " ".join([typed(), *sources().words, *_short_overrides(self)])
 
+    @property
+    def sweep_command(self) -> str:
+        """The command line that makes this run after the teacher that it needs."""
+        return " ".join([typed(), "-m", *sources().words, *_short_overrides(self)])
+
 
 def specify(config: ExperimentConfig) -> RunSpec:
     """Finds out which run the settings mean."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from acmr.agent.architecture import Dimensions
 from acmr.config import ZERO, ConfigError, ExperimentConfig
 from acmr.envs import describe
-from acmr.settings.run_spec import teacher_spec
+from acmr.settings.run_spec import specify, teacher_spec
 from acmr.storage.run_dir import RunDir
 from acmr.transfer.methods import check_body
 from acmr.transfer.statistics import with_statistics
@@ -43,6 +43,7 @@ def _implied(config: ExperimentConfig, dims: Dimensions) -> Teacher:
         state = "is not finished" if run_dir.stored_settings() else "does not exist"
         raise ConfigError(
             f"transfer={config.transfer.name}: the teacher's run {source.directory} {state}; "
-            f"train it with: {source.command} (or give another one: transfer.teacher=PATH)"
+            f"train it with: {source.command} (or both, one after the other: {specify(config).sweep_command}; "
+            "or give another one: transfer.teacher=PATH)"
         )
     return load_teacher(source.directory)

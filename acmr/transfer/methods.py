@@ -1,8 +1,8 @@
 """Actor-Critic Model Reuse: what a student takes from its teacher, layer by layer (paper, section 3.2).
 
 A method is one function: it takes the student with its fresh networks and the teacher, and returns the networks to
-learn with and which layers came from the teacher. One of your own is a module of its name in this package and a YAML
-file in ``conf/transfer``, with the rules that teacher and student must keep (docs/howto-transfer.md).
+learn with and which layers came from the teacher. One of your own is a function in a module anywhere and a YAML file in
+``conf/transfer`` or a folder of yours, with the rules that teacher and student must keep (docs/howto-transfer.md).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from acmr.agent.architecture import Dimensions, is_hidden
 from acmr.agent.networks import Networks
 from acmr.config import ConfigError, TransferConfig
-from acmr.registry import Registry
+from acmr.registry import Registry, named_in
 from acmr.transfer.audition import Audition, Biases
 from acmr.transfer.report import TransferReport, report_transfer
 from acmr.transfer.teacher import Teacher
@@ -81,6 +81,20 @@ METHODS: Registry[Method] = Registry("transfer.name", "acmr.transfer")
 method = METHODS.add
 
 
+def find_method(config: TransferConfig) -> Method:
+    """The function that a method is: in a module of the user's, or the one that is registered under its name.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    if config.method is None:
+        return METHODS.find(config.name)
+    found: Method = named_in("transfer.method", config.method)
+    if not callable(found):
+        raise ConfigError(f"transfer.method={config.method}: no function (docs/howto-transfer.md)")
+    return found
+
+
 def transfer(
     student: Student,
     teacher: Teacher | None,
@@ -100,7 +114,7 @@ def transfer(
     Raises:
         ConfigError: If the teacher does not fit the method.
     """
-    take = METHODS.find(config.name)
+    take = find_method(config)
     if teacher is not None:
         check_body(config, f"the teacher {teacher.path}", teacher.description.dims, student.networks.dims)
         _check_widths(config, teacher, student.networks)
