@@ -5,7 +5,7 @@
 
 import sys
 
-from acmr_app.training import main
+from acmr.app.training import main
 
 if __name__ == "__main__":
     sys.exit(main())

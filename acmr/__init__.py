@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from acmr.command import open_closed_streams
 
 if TYPE_CHECKING:
-    from acmr_app.policies import Policy, load
-    from acmr_app.results import Results, results
-    from acmr_app.runs import Run, train
+    from acmr.app.policies import Policy, load
+    from acmr.app.results import Results, results
+    from acmr.app.runs import Run, train
 
 __version__ = "0.1.0"
 __all__ = ["Policy", "Results", "Run", "load", "results", "train"]
@@ -27,14 +27,14 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'acmr' has no attribute {name!r}; it offers {', '.join(__all__)}")
     if name in ("Run", "train"):
-        from acmr_app import runs
+        from acmr.app import runs
 
         return getattr(runs, name)
     if name in ("Policy", "load"):
-        from acmr_app import policies
+        from acmr.app import policies
 
         return getattr(policies, name)
-    from acmr_app import results
+    from acmr.app import results
 
     return getattr(results, name)
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from acmr_app.commands import main
+from acmr.app.commands import main
 
 sys.exit(main())

@@ -40,7 +40,7 @@ SUBCOMMANDS = {
     "evaluate": "acmr.evaluation",
     "envs": "acmr.envs",
     "mirror": "acmr.tracking.mirror",
-    "export": "acmr_app.exports",
+    "export": "acmr.app.exports",
 }
 #: Who was started as ``acmr`` is told ``acmr`` words; so are its workers, and whoever has no ``run.py``.
 _STARTED_AS = "ACMR_STARTED_AS"

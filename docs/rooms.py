@@ -13,12 +13,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "docs" / "images" / "rooms.svg"
-PACKAGES = ("acmr", "analysis", "sweeps", "acmr_app")
+PACKAGES = ("acmr", "analysis", "sweeps")
 #: Modules of the ground are one room: everything may import them.
 GROUND = "acmr"
+#: Where users come in: a room of ``acmr`` that stands above all the others, those of the other packages, too.
+TOP = "acmr.app"
 
 _WIDTH, _TITLE, _LINE, _GAP, _ROW_GAP = 168, 22, 13, 16, 16
-_COLORS = {"acmr": "#e8f1fa", "analysis": "#eef6e9", "sweeps": "#fbf0e2", "acmr_app": "#f3ecf7"}
+_COLORS = {"acmr": "#e8f1fa", "analysis": "#eef6e9", "sweeps": "#fbf0e2", TOP: "#f3ecf7"}
 
 
 def read_rule(package: str) -> list[list[set[str]]]:
@@ -78,21 +80,21 @@ def imported_rooms() -> dict[str, list[str]]:
     for module, path in modules().items():
         others = {room_of(name) for name in imports(path) if name in modules()}
         # What the ground passes on to users of the package belongs to the room that it comes from.
-        others -= {"acmr_app"} if room_of(module) == GROUND else set()
+        others -= {TOP} if room_of(module) == GROUND else set()
         direct.setdefault(room_of(module), set()).update(others - {room_of(module), GROUND, "analysis"})
     return {room: sorted(others) for room, others in direct.items()}
 
 
 def rows() -> list[list[str]]:
-    """Rooms by row, lowest first: ``acmr`` by its rule, ``analysis`` beside, ``sweeps`` and ``acmr_app`` above."""
+    """Rooms by row, lowest first: ``acmr`` by its rule, ``analysis`` beside, ``sweeps`` and ``acmr.app`` above."""
     names = rooms()
     acmr = [[f"acmr.{part}" for group in level for part in sorted(group)] for level in read_rule("acmr")]
-    table = [[room for room in level if room in names] for level in acmr[1:]]
+    table = [[room for room in level if room in names and room != TOP] for level in acmr[1:-1]]
     table = [[GROUND], *table, [room for room in names if room.startswith("sweeps")]]
     beside = [[f"analysis.{part}" for group in level for part in sorted(group)] for level in read_rule("analysis")]
     for index, level in enumerate(beside):
         table[min(index + 1, len(table) - 1)] += [room for room in level if room in names]
-    return [*table, [room for room in names if room.startswith("acmr_app")]]
+    return [*table, [TOP]]
 
 
 def draw() -> str:
@@ -124,7 +126,7 @@ def _box(room: str, inside: list[str], left: float, top: float, height: float) -
         color = "#a33" if name.startswith("\N{RIGHTWARDS ARROW}") else "#222"
         place = f'x="{left + 10:g}" y="{top + 19 + _LINE * (index + 1):g}"'
         lines.append(f'<text {place} font-size="11" fill="{color}">{escape(name)}</text>')
-    color = _COLORS[room.split(".")[0]]
+    color = _COLORS[room if room in _COLORS else room.split(".")[0]]
     shape = f'<rect x="{left:g}" y="{top:g}" width="{_WIDTH}" height="{height}" rx="6" fill="{color}" stroke="#888"/>'
     return "\n".join([shape, *lines])
 

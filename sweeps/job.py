@@ -33,7 +33,7 @@ _SCRIPT = Path(__file__).resolve().parent.parent / "run.py"
 #: The checkout that this is; None: the program is installed, and found from anywhere.
 CHECKOUT = _SCRIPT.parent if _SCRIPT.is_file() else None
 #: A checkout's own file, whatever else is installed; else a module, and not the folder's own before it (-P).
-_STARTER = [str(_SCRIPT)] if CHECKOUT else ["-P", "-m", "acmr_app.training"]
+_STARTER = [str(_SCRIPT)] if CHECKOUT else ["-P", "-m", "acmr.app.training"]
 #: Environment variable with the process that a training must not outlive.
 PARENT = "ACMR_SWEEP_WORKER"
 #: Signals that end a sweep in good order; its processes inherit that they are blocked.

@@ -14,9 +14,9 @@ from guides import ROOT, blocks
 
 import acmr
 from acmr.agent.architecture import Dimensions
+from acmr.app.exports import main
+from acmr.app.sb3 import write_sb3
 from acmr.transfer.teacher import load_teacher
-from acmr_app.exports import main
-from acmr_app.sb3 import write_sb3
 
 DOCUMENT = ROOT / "docs" / "exchange.md"
 CORES = [None, Dimensions(27, 8)]

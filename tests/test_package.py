@@ -28,7 +28,7 @@ SETTINGS = "name: swing\nid: my_robots:Swing-v0\nsource: swing\n"
 
 def test_the_wheel_names_every_package():
     told = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
-    there = {path.parent for top in ("acmr", "sweeps", "analysis", "acmr_app") for path in (ROOT / top).rglob("*.py")}
+    there = {path.parent for top in ("acmr", "sweeps", "analysis") for path in (ROOT / top).rglob("*.py")}
     assert {str(path.relative_to(ROOT)).replace("/", ".") for path in there} == set(told) - {
         "hydra_plugins",
         "acmr.conf",

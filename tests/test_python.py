@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
 def test_importing_it_loads_nothing_that_takes_long():
     loaded = "import sys, acmr; print(sorted({m.partition('.')[0] for m in sys.modules}))"
     done = subprocess.run([sys.executable, "-c", loaded], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert not {"torch", "numpy", "mujoco", "gymnasium", "pandas", "hydra", "wandb", "acmr_app"} & set(
+    assert not {"torch", "numpy", "mujoco", "gymnasium", "pandas", "hydra", "wandb", "acmr.app"} & set(
         eval(done.stdout)
     )
     assert {"train", "load", "results"} <= set(dir(acmr))

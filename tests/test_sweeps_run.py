@@ -261,7 +261,7 @@ def test_a_stopped_sweep_leaves_no_process_and_the_same_command_ends_it(out, num
 @pytest.mark.slow
 def test_what_is_edited_in_mid_sweep_changes_nothing(out, tmp_path):
     root = tmp_path / "copy"
-    for name in ("acmr", "acmr_app", "sweeps", "hydra_plugins", "conf"):
+    for name in ("acmr", "sweeps", "hydra_plugins", "conf"):
         shutil.copytree(ROOT / name, root / name)
     shutil.copy(ROOT / "run.py", root)
     sweep = start(out, "-m", *FOUR, *TINY, "agent.hidden_sizes=[16,16]", root=root)

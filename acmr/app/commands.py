@@ -21,7 +21,7 @@ def main() -> int:
         return 0
     if word == "train" or word.startswith("-") or "=" in word:
         # Here, so that other commands need not wait for it.
-        from acmr_app.training import main as train
+        from acmr.app.training import main as train
 
         sys.argv[1:] = rest if word == "train" else sys.argv[1:]
         return train()

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor, nn
 
 from acmr.agent.networks import Actor
+from acmr.app.sb3 import write_sb3
 from acmr.command import command, typed
 from acmr.config import ConfigError
 from acmr.evaluation.evaluate import load_policy
 from acmr.names import terminal
 from acmr.transfer.teacher import Teacher
-from acmr_app.sb3 import write_sb3
 
 #: What the numbers that go in and out are called in a file of ONNX.
 OBSERVATION, ACTION = "observation", "action"

@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 import torch
 
+from acmr.app.policies import Policy, load
 from acmr.config import ConfigError
 from acmr.records import EPISODES_FILE
 from acmr.run.experiment import run_experiment
@@ -20,7 +21,6 @@ from acmr.settings.command_line import hydra_arguments
 from acmr.settings.compose import as_override, compose_config, look_in, parse, sources
 from acmr.settings.errors import USER_ERRORS, check_booleans, explain
 from acmr.settings.run_spec import RunSpec, specify
-from acmr_app.policies import Policy, load
 
 
 @dataclass(frozen=True)
