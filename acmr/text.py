@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import takewhile
 
 from acmr.names import terminal
@@ -21,7 +21,21 @@ _PARTS, _SEPARATORS = re.compile(r"(?=-[A-Za-z]|  |/)"), "- /"
 
 def message(error: BaseException) -> str:
     """The message of an error on one line of visible letters, or its type where it has none: ``no such file``."""
-    return without_userinfo(terminal(" ".join(str(error).split())))[:LONGEST_MESSAGE] or type(error).__name__
+    return without_userinfo(terminal(" ".join(_said(error, str).split())))[:LONGEST_MESSAGE] or type(error).__name__
+
+
+def brief(value: object, longest: int = 60) -> str:
+    """Type and value on one line of at most so many letters and the type: ``list [1, 2]``."""
+    text = " ".join(_said(value, repr).split())
+    return f"{type(value).__name__} {text if len(text) <= longest else text[: longest - 3] + '...'}".rstrip()
+
+
+def _said(value: object, how: Callable[[object], str]) -> str:
+    """What an object says of itself; nothing where its own code fails at that, as somebody else's may."""
+    try:
+        return how(value)
+    except Exception:
+        return ""
 
 
 def holds_userinfo(value: object) -> bool:

@@ -193,6 +193,7 @@ def test_an_observation_may_be_anything_that_is_so_many_numbers(value: Any) -> N
         (None, "NoneType of object, but numbers are needed"),
         ([1, [2], 3], "no array of numbers"),
         ({"a": 1}, "dict of object, but numbers are needed"),
+        (np.ma.masked_array([1.0, 2, 3], [False, True, False]), "is masked in part, but every number is needed"),
         ([1, np.nan, 3], "first observation is not finite"),
     ],
     ids=repr,

@@ -124,13 +124,15 @@ gym.register("AcmrWrong-v0", Wrong, max_episode_steps=20)
             {"position": [0, 1, 2], "mode": 1},
             r"\['position'\] has the shape \(3,\), but its space declares \(2,\)",
         ),
-        ("Dict", {"position": [0, 1]}, "does not have the 2 parts that its space declares"),
+        ("Dict", {"position": [0, 1]}, r"\['mode'\] is missing"),
         ("Dict", {"position": [0, 1], "mood": 1}, r"\['mode'\] is missing"),
+        ("Dict", {"position": [0, 1], "mode": 1, "mood": 1}, "has 'mood', which its space does not declare"),
         ("Dict", [0, 1], r"\['mode'\] is missing"),
-        ("Dict", 3, "does not have the 2 parts"),
-        ("Nested", {"arm": {}, "grip": 0, "push": [0, 1]}, r"\['arm'\] does not have the 1 parts"),
+        ("Dict", 3, "is int 3, but its space declares 2 parts"),
+        ("Nested", {"arm": {}, "grip": 0, "push": [0, 1]}, r"\['arm'\]\['angle'\] is missing"),
+        ("Nested", {"arm": None, "grip": 0, "push": [0, 1]}, r"\['arm'\] is NoneType None, but its space declares 1"),
         ("Nested", {"arm": {"angle": "ab"}, "grip": 0, "push": [0, 1]}, r"\['arm'\]\['angle'\] is str of"),
-        ("Tuple", [[0, 1], [0, 1], [2]], "does not have the 2 parts"),
+        ("Tuple", [[0, 1], [0, 1], [2]], r"is list \[.*\], but its space declares 2 parts"),
         ("Tuple", [[0, 1], [0.5, 1]], r"\[1\] holds numbers that are no int64"),
     ],
 )
@@ -148,6 +150,65 @@ def test_spaces_without_a_number_of_numbers_are_refused(space: gym.Space[Any]) -
         ConfigError, match=f"its observations are a {type(space).__name__} space.*Dict and Tuple of these"
     ):
         make_env(sampled("Odd"))
+
+
+class Spaced(gym.Env[Any, Any]):
+    """Has the spaces that it is given, and none where it is given none."""
+
+    def __init__(self, **spaces: Any) -> None:
+        vars(self).update(spaces)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> Any:
+        assert self.action_space.contains(action), action
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+gym.register("AcmrSpaced-v0", Spaced, max_episode_steps=20)
+LARGEST = np.finfo(np.float32).max
+
+
+@pytest.mark.parametrize(
+    ("spaces", "says"),
+    [
+        (
+            {"observation_space": ...},
+            "its observation_space is nothing, but one of gymnasium.spaces is needed; set self",
+        ),
+        ({"action_space": ...}, "its action_space is nothing"),
+        ({"observation_space": None}, "its observation_space is nothing"),
+        ({"observation_space": (3,)}, r"its observation_space is tuple \(3,\), but one of gymnasium.spaces"),
+        ({"action_space": Box}, "its action_space is type <class"),
+        ({"observation_space": Dict({})}, r"its observation_space Dict\(\) holds no numbers"),
+        ({"observation_space": Tuple((Dict({}), Box(-1, 1, (0,))))}, "its observation_space .* holds no numbers"),
+        ({"observation_space": Box(*REAL, (3, 0))}, "its observation_space .* holds no numbers"),
+        ({"action_space": Box(-1, 1, (0,))}, "its action_space .* holds no numbers"),
+        ({"action_space": Box(-LARGEST, LARGEST, (2,))}, "to 3.4028234663852886e.38, which is too wide for"),
+        ({"action_space": Box(-1e200, 1e200, (2,), np.float64)}, "too wide for the policy's float32; scale them"),
+        ({"action_space": Box(1e6, 1e6 + 0.01, (1,), np.float64)}, "from 1000000.0 to 1000000.01, which is too narrow"),
+        ({"action_space": Box(np.array([-1.0, 0]), np.array([1, 1e-45]), dtype=np.float64)}, "0.0 to 1e-45.*narrow"),
+    ],
+    ids=lambda value: str(value)[:60],
+)
+def test_spaces_that_are_none_or_empty_or_out_of_range_are_refused(spaces: dict[str, Any], says: str) -> None:
+    kwargs = {"observation_space": Box(*REAL, (2,)), "action_space": Box(-1, 1, (1,)), **spaces}
+    given_spaces = {name: space for name, space in kwargs.items() if space is not ...}
+    with pytest.raises(ConfigError, match=f"^env.id=AcmrSpaced-v0: .*{says}") as caught:
+        make_env(EnvConfig("spaced", "AcmrSpaced-v0", "spaced", kwargs=given_spaces))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("low", [np.float32(-1), np.float64(0), np.float16(-3)], ids=repr)
+def test_an_action_may_have_no_dimension(low: Any) -> None:
+    spaces = {"observation_space": Box(*REAL, ()), "action_space": Box(low, low.dtype.type(2), (), low.dtype.type)}
+    config = EnvConfig("spaced", "AcmrSpaced-v0", "spaced", kwargs=spaces)
+    about, env = describe(config), make_env(config)
+    assert (about.action_names, about.action_low) == (("action/0",), (float(low),))
+    assert env.reset()[0].shape == env.step(np.ones(1, np.float32))[0].shape == (1,)
+    assert check_resume(config).when
 
 
 class Telling(gym.Env[Any, Any]):

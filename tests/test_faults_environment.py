@@ -25,6 +25,15 @@ class Simulator:
     mended = False
 
 
+class SpeechlessError(Exception):
+    """Cannot say what it is."""
+
+    def __str__(self) -> str:
+        raise AttributeError("no text")
+
+    __repr__ = __str__
+
+
 class Failing(gym.Env[Any, Any]):
     """Fails in some way in its 130th step."""
 
@@ -48,6 +57,10 @@ class Failing(gym.Env[Any, Any]):
                 info["missing"]
             if self.how == "exit":
                 raise SystemExit(0)
+            if self.how == "speechless":
+                raise SpeechlessError
+            if self.how == "speechless reward":
+                reward = SpeechlessError()
             if self.how == "numbers":
                 observation = np.zeros(4, np.float32)
             if self.how == "reward":
@@ -60,6 +73,8 @@ gym.register("AcmrFailing-v0", Failing, max_episode_steps=30)
 HOW = {
     "raise": r"KeyError: 'missing' \(test_faults_environment.py:\d+, in step\)",
     "exit": r"SystemExit: 0 \(test_faults_environment.py:\d+, in step\)",
+    "speechless": r"SpeechlessError \(test_faults_environment.py:\d+, in step\)",
+    "speechless reward": "its reward is SpeechlessError, but one number is needed",
     "reset": r"ConnectionError: no simulator at port 7 \(test_faults_environment.py:\d+, in reset\)",
     "numbers": r"its observation has the shape \(4,\), but its space declares \(3,\)",
     "reward": r"its reward is NoneType None, but one number is needed",
@@ -67,7 +82,7 @@ HOW = {
 
 
 def failing(folder: Any, how: str) -> Run:
-    words = ("env=gym", "env.id=AcmrFailing-v0", f"+env.kwargs.how={how}", "total_timesteps=200", *SMALL)
+    words = ("env=gym", "env.id=AcmrFailing-v0", f"+env.kwargs.how='{how}'", "total_timesteps=200", *SMALL)
     return Run(folder, words)
 
 

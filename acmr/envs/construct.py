@@ -21,9 +21,9 @@ from gymnasium.spaces import Box
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs.bodies import without_bodies
 from acmr.envs.conversion import ConvertedEnv, FaultyEnvironmentError, place_of
-from acmr.envs.spaces import is_usable
+from acmr.envs.spaces import is_empty, is_usable
 from acmr.envs.wrappers import near_matches
-from acmr.text import one_line
+from acmr.text import brief, one_line
 
 #: What MuJoCo says of Gymnasium's own model files, of no use to who runs them.
 _MODEL_REMARK = r"compiler attribute .* is deprecated"
@@ -155,6 +155,16 @@ def _reason(config: EnvConfig, creator: Any, error: BaseException) -> str:
 
 
 def _check_spaces(env_id: str, env: gym.Env[Any, Any]) -> None:
+    for name in ("observation_space", "action_space"):
+        space = getattr(env, name, None)
+        if not isinstance(space, gym.Space):
+            what = "nothing" if space is None else brief(space)
+            raise ConfigError(
+                f"env.id={env_id}: its {name} is {what}, but one of gymnasium.spaces is needed; set self.{name} in its "
+                "__init__, as in gymnasium.spaces.Box(-1.0, 1.0, (3,))"
+            )
+        if is_usable(space) and is_empty(space):
+            raise ConfigError(f"env.id={env_id}: its {name} {space} holds no numbers; one at least is needed")
     if not is_usable(env.observation_space):
         raise ConfigError(
             f"env.id={env_id}: its observations are a {type(env.observation_space).__name__} space that is no fixed "
@@ -172,4 +182,15 @@ def _check_spaces(env_id: str, env: gym.Env[Any, Any]) -> None:
         raise ConfigError(
             f"env.id={env_id}: its actions range from {action.low.min():g} to {action.high.max():g}, but each needs a "
             "finite least and a greater most value"
+        )
+    # The policy's numbers are float32: there a range of all finite numbers is infinite, and 1e6 to 1e6 + 0.01 is one.
+    with np.errstate(over="ignore"):
+        low, high = action.low.astype(np.float32), action.high.astype(np.float32)
+        usable = np.isfinite(high - low) & ((high - low) / 2 > 0)
+    if not usable.all():
+        low_given, high_given = (float(ends[~usable].flat[0]) for ends in (action.low, action.high))
+        raise ConfigError(
+            f"env.id={env_id}: its actions range from {low_given} to {high_given}, which is too "
+            f"{'wide' if high_given - low_given > 1 else 'narrow'} for the policy's float32; scale them, as "
+            "gymnasium.wrappers.RescaleAction does"
         )

@@ -19,7 +19,7 @@ from gymnasium.spaces import Box
 from acmr.config import ConfigError
 from acmr.envs.spaces import flat_space, flattened, names_of, to_array
 from acmr.records import REWARD_PREFIX, VELOCITY_KEY
-from acmr.text import one_line
+from acmr.text import brief, one_line
 
 #: An error is shown where the environment's own code is: not in wrappers, unless they are its own, ...
 _PASSING_ON = (os.path.dirname(gym.__file__), os.path.dirname(__file__))
@@ -28,7 +28,7 @@ _GYMNASIUM_S = os.path.join(os.path.dirname(gym.__file__), "envs", "")
 #: ... and not in a library that it calls, unless it is all library.
 _LIBRARIES = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 _RETURNS = {
-    "reset": "reset must return (observation, info)",
+    "reset": "reset(seed=..., options=...) must return (observation, info)",
     "step": "step must return (observation, reward, terminated, truncated, info)",
 }
 
@@ -136,7 +136,7 @@ class ConvertedEnv(gym.Wrapper[np.ndarray, np.ndarray, Any, Any]):
     def _reward(self, given: Any) -> float:
         value = number(given)
         if value is None:
-            raise self.fault(f"its reward is {_shown(given)}, but one number is needed")
+            raise self.fault(f"its reward is {brief(given)}, but one number is needed")
         return value
 
     def _flag(self, name: str, given: Any) -> bool:
@@ -144,14 +144,14 @@ class ConvertedEnv(gym.Wrapper[np.ndarray, np.ndarray, Any, Any]):
             return given
         value = number(given)
         if value not in (0.0, 1.0):
-            raise self.fault(f"its {name} is {_shown(given)}, but True or False is needed")
+            raise self.fault(f"its {name} is {brief(given)}, but True or False is needed")
         return bool(value)
 
     def _info(self, given: Any) -> dict[str, Any]:
         if given is None:
             return {}
         if type(given) is not dict and not isinstance(given, Mapping):
-            raise self.fault(f"its info is {_shown(given)}, but a dictionary is needed")
+            raise self.fault(f"its info is {brief(given)}, but a dictionary is needed")
         info = dict(given)
         for key, value in given.items():
             # Nearly all are floats already.
@@ -191,11 +191,6 @@ def number(given: Any) -> float | None:
     except Exception:
         return None
     return float(array.item()) if array.size == 1 and array.dtype.kind in "biuf" else None
-
-
-def _shown(given: Any) -> str:
-    text = " ".join(repr(given).split())
-    return f"{type(given).__name__} {text if len(text) <= 60 else text[:57] + '...'}"
 
 
 def place_of(error: BaseException) -> str | None:

@@ -106,7 +106,8 @@ def probe(env: ConvertedEnv) -> Probe:
     if not np.isfinite(first).all():
         raise env.fault("its first observation is not finite")
     for _ in range(PROBE_STEPS):
-        action = rng.uniform(action_space.low, action_space.high).astype(action_space.dtype)
+        # NumPy draws a float where the bounds are arrays without a dimension.
+        action = np.asarray(rng.uniform(action_space.low, action_space.high), action_space.dtype)
         observation, reward, terminated, truncated, info = env.step(action)
         if not (np.isfinite(observation).all() and np.isfinite(reward)):
             raise env.fault("its observation or its reward is not finite")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sized
+from collections.abc import Iterator, Mapping, Sized
 from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
 from gymnasium.spaces.utils import flatdim, flatten, flatten_space
+
+from acmr.text import brief
 
 #: Spaces whose values are a fixed number of numbers; a choice among n is n numbers, one of them 1.
 USABLE = (Box, Dict, Tuple, Discrete, MultiBinary, MultiDiscrete)
@@ -16,6 +18,11 @@ USABLE = (Box, Dict, Tuple, Discrete, MultiBinary, MultiDiscrete)
 def is_usable(space: Space[Any]) -> bool:
     """Whether the values of a space are a fixed number of numbers."""
     return isinstance(space, USABLE) and all(map(is_usable, _parts(space).values()))
+
+
+def is_empty(space: Space[Any]) -> bool:
+    """Whether the values of a usable space hold no number at all."""
+    return flatdim(space) == 0
 
 
 def names_of(space: Space[Any]) -> tuple[str, ...]:
@@ -62,6 +69,8 @@ def to_array(given: Any, shape: tuple[int, ...], dtype: np.dtype[Any], title: st
         array = np.asarray(given)
     except Exception as error:
         raise ValueError(f"{title} is no array of numbers ({' '.join(str(error).split())[:120]})") from error
+    if np.ma.is_masked(given):
+        raise ValueError(f"{title} is masked in part, but every number is needed")
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{title} is {type(given).__name__} of {array.dtype}, but numbers are needed")
     if _lengths(array.shape) != _lengths(shape):
@@ -95,14 +104,21 @@ def _values(given: Any, space: Space[Any], title: str) -> Iterator[np.ndarray]:
         yield _leaf(given, space, title)
         return
     parts = _parts(space)
-    if not isinstance(given, Sized) or isinstance(given, str) or len(given) != len(parts):
-        raise ValueError(f"{title} does not have the {len(parts)} parts that its space declares")
+    if not isinstance(given, Mapping) and not _holds(given, len(parts)):
+        raise ValueError(f"{title} is {brief(given)}, but its space declares {len(parts)} parts")
     for key, part in parts.items():
         try:
-            value = given[key]  # type: ignore[index]
+            value = given[key]
         except (LookupError, TypeError) as error:
             raise ValueError(f"{title}[{key!r}] is missing, which its space declares") from error
         yield from _values(value, part, f"{title}[{key!r}]")
+    if isinstance(given, Mapping) and (more := [key for key in given if key not in parts]):
+        raise ValueError(f"{title} has {more[0]!r}, which its space does not declare")
+
+
+def _holds(given: Any, count: int) -> bool:
+    """Whether it is something of so many parts."""
+    return isinstance(given, Sized) and not isinstance(given, str) and len(given) == count
 
 
 def _leaf(given: Any, space: Space[Any], title: str) -> np.ndarray:
