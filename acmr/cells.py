@@ -76,7 +76,7 @@ CELLS = {
         Cell("A3", TARGET, "expand", False, "Conf. 3", "A0", "transfer", "red", "D", published=True),
         Cell("A4", TARGET, "expand", True, "Conf. 4", "A0", "transfer", "purple", "v", published=True),
         Cell("N1", TARGET, "named", False, "By name", "A0", "named", "pink", "*"),
-        Cell("N2", TARGET, "named", False, "By name, random", "A0", "named", "olive", "p", {"agent.start": "random"}),
+        Cell("N2", TARGET, "named", False, "By name, random", "A0", "named", "gray", "p", {"agent.start": "random"}),
     )
 }
 

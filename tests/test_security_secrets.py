@@ -190,7 +190,10 @@ def older(tmp_path: Path) -> Path:
     (run / "teacher.json").write_text(json.dumps(description))
     teacher = {"path": settings["transfer"]["teacher"], "environment": "ant", "seed": 7}
     (run / "transfer.json").write_text(json.dumps({"method": "hidden", "teacher": teacher}))
+    episode = {"episodic_return": 1.0, "episode_length": 10, "terminated": False, "mean_forward_velocity": None}
     evaluated = {"policy": "deterministic", "seed": 0, "episodes": 20, "fall_rate": 0.0, "run": str(run)}
+    evaluated |= {"mean_return": 1.0, "std_return": 0.0, "min_return": 1.0, "max_return": 1.0, "mean_length": 10.0}
+    evaluated["each"] = [episode | {"seed": seed} for seed in range(20)]
     (run / "evaluation.json").write_text(json.dumps(evaluated | {"sha256": description["sha256"]}))
     (run / "episodes.csv").write_text("global_step,episodic_return,episode_length\n10,1.0,10\n")
     return run
