@@ -40,14 +40,12 @@ def _train_as_typed() -> None:
     import hydra
 
     from acmr.settings.command_line import hydra_arguments
-    from acmr.settings.compose import CONFIG_FOLDER, register_schema, sources
+    from acmr.settings.compose import CONFIG_FOLDER, register_schema
 
     sys.argv[1:] = hydra_arguments(sys.argv[1:])
     register_schema()
     # The folder's own path: Hydra would look beside this file, which may have been called through a link.
-    train = hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="config")(_train)
-    with sources().refusing_circles():
-        train()
+    hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="config")(_train)()
 
 
 def _train(cfg: DictConfig) -> None:

@@ -87,14 +87,6 @@ def _expand_paths(config: ExperimentConfig) -> None:
             continue
         if not value.strip():
             raise ConfigError(f"{key}=: a path is needed, as in {key}={'runs' if key == 'output_dir' else 'FOLDER'}")
-        # Each would become a folder of that name, in which nobody looks for runs.
-        if "://" in value:
-            raise ConfigError(f"{key}={value}: is an address; type a folder of this machine, as in {key}=FOLDER")
-        if re.match(r"\$\w|\$\{", value):
-            raise ConfigError(
-                f"{key}={value}: is not looked up here; let the shell do it, without single quotes around it, "
-                f"or type ./{value} for a folder of that name"
-            )
         # A shell does so at the beginning of a word only, not behind an equal sign.
         path = os.path.expanduser(value)
         if path.startswith("~"):
