@@ -42,6 +42,8 @@ SUBCOMMANDS = {
     "mirror": "acmr.tracking.mirror",
     "export": "acmr.app.exports",
 }
+#: Whether this is a checkout; looked up once, for later the place may be one that this process may not look into.
+_IN_CHECKOUT = os.path.isfile(Path(__file__).resolve().parents[1] / SUBCOMMANDS["train"])
 #: Who was started as ``acmr`` is told ``acmr`` words; so are its workers, and whoever has no ``run.py``.
 _STARTED_AS = "ACMR_STARTED_AS"
 if Path(sys.argv[0] if getattr(sys, "argv", None) else "").stem == PROGRAM:
@@ -55,8 +57,7 @@ def typed(subcommand: str = "train") -> str:
         subcommand: A key of :data:`SUBCOMMANDS`.
     """
     module = SUBCOMMANDS[subcommand]
-    in_checkout = (Path(__file__).resolve().parents[1] / SUBCOMMANDS["train"]).is_file()
-    if in_checkout and os.environ.get(_STARTED_AS) != PROGRAM:
+    if _IN_CHECKOUT and os.environ.get(_STARTED_AS) != PROGRAM:
         return f"python {module}" if subcommand == "train" else f"python -m {module}"
     return PROGRAM if subcommand == "train" else f"{PROGRAM} {subcommand}"
 
