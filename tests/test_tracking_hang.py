@@ -132,10 +132,38 @@ def test_what_hangs_is_given_up_in_time_with_one_line(where):
         guarded.on_episode(EpisodeRecord(step, 1.0, 1))
         time.sleep(0.01)
     guarded.close({})
+    # As the program ends; nothing more is waited for.
+    observer.hand_over()
     assert time.monotonic() - began < 3
     assert ended.is_set()
     assert len(said) == 1
     assert "stopped: TimeoutError: it " in said[0]
+
+
+def test_rows_that_wait_are_handed_over_where_nobody_closes():
+    heard: list = []
+    observer, ended = made("nowhere", heard)
+    for step in range(500):
+        observer.on_episode(EpisodeRecord(step, 1.0, 1))
+    observer.hand_over()
+    assert heard == list(range(500))
+    assert not ended.is_set()
+
+
+def test_what_never_answers_is_not_waited_for_again():
+    class Deaf(Stuck):
+        def wait(self, place: str) -> None:
+            if place == "episode":
+                time.sleep(5)
+
+    observer = Threaded(lambda: Deaf("", threading.Event(), []), lambda: None, patience=0.1, close_wait=0.1)
+    observer.on_episode(EpisodeRecord(1, 1.0, 1))
+    time.sleep(0.2)
+    with pytest.raises(TimeoutError):
+        observer.on_episode(EpisodeRecord(2, 1.0, 1))
+    began = time.monotonic()
+    observer.hand_over()
+    assert time.monotonic() - began < 0.5
 
 
 def test_a_full_queue_is_given_up(monkeypatch):

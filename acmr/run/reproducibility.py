@@ -25,8 +25,8 @@ _REPORTED_LIBRARIES = ("acmr", "torch", "numpy", "gymnasium", "mujoco", "hydra-c
 _LIBRARIES = ("python", "torch", "numpy", "gymnasium", "mujoco")
 #: Where a run begins, and the package that it is of.
 _ROOT, _OURS = "acmr.run.experiment", "acmr"
-#: Packages of it that only name, show or send a run; every other one may decide what it computes.
-_ASIDE = frozenset(("settings", "tracking", "evaluation"))
+#: Packages of it that only name, start, show or send a run; every other one may decide what it computes.
+_ASIDE = frozenset(("settings", "tracking", "evaluation", "app"))
 
 
 def fingerprint(threads: int, device: str, environment_trace: bytes, chosen: tuple[str, ...] = ()) -> dict[str, str]:

@@ -90,7 +90,9 @@ class Threaded(Observer):
         self._raise()
 
     def hand_over(self) -> None:
-        """Waits a moment for what was told to be through; nothing is raised."""
+        """Waits a moment for what was told to be through, unless it was given up; nothing is raised."""
+        if self._hangs:
+            return
         through = threading.Event()
         with suppress(queue.Full):
             self._waiting.put_nowait((lambda observer: through.set(), False))
