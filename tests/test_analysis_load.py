@@ -11,7 +11,7 @@ from analysis_runs import HEADER, PAIRS, csv_text, rows_reaching, run_directory,
 
 from acmr.cells import CELLS
 from analysis.loading.load import InputError, RunSet, load
-from analysis.loading.missing import missing_runs
+from analysis.loading.missing import matrix_command, missing_runs, planned_runs, planned_seeds
 
 
 @pytest.fixture
@@ -232,6 +232,27 @@ def test_files_of_other_tools_are_passed_over(root):
         (root / folder / "summary.json").write_text("{}")
         (root / folder / "config.yaml").write_text("{}")
     assert len(load(root).runs) == 1
+
+
+def test_seeds_of_a_cell_beyond_the_paper_are_its_own(root):
+    for seed in (1, 2, 3):
+        write_run(root, "A0", seed, rows_reaching(6000, 20_000), profile="quick")
+    for seed in (1, 2, 5):
+        write_run(root, "N1", seed, rows_reaching(6000, 20_000), profile="quick")
+    data = load(root)
+    assert planned_seeds(data.runs) == [1, 2, 3]
+    assert planned_seeds(data.runs, "N1") == [1, 2, 3, 5]
+    assert planned_runs(data) == 7 * 3 + 4
+    missing = missing_runs(data)
+    assert {run.seed for run in missing if run.cell != "N1"} == {1, 2, 3}
+    assert [run.seed for run in missing if run.cell == "N1"] == [3]
+    assert matrix_command(data) == "python run.py matrix=quick experiment=H0,H1,A0,A1,A2,A3,A4,N1"
+    # A seed that only N1 is to have is named with N1's cell, not asked of all.
+    (run_directory(root, "N1", 5, "quick") / "summary.json").unlink()
+    for cell in ("H0", "H1", "A1", "A2", "A3", "A4"):
+        for seed in (1, 2, 3):
+            write_run(root, cell, seed, rows_reaching(6000, 20_000), profile="quick")
+    assert matrix_command(load(root)) == "python run.py matrix=quick experiment=N1 seed=3,5"
 
 
 def test_what_is_missing_is_said_with_the_command_that_makes_it(root):
