@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import pandas as pd
 
@@ -37,7 +36,6 @@ def p_value(value: float) -> str:
     return f"{value:.3f}" if value >= 0.0005 else "< 0.001"
 
 
-def span(row: Mapping[Hashable, Any], name: str) -> str:
-    """A number of steps with its interval, as ``difference`` with ``difference_low`` and ``difference_high``."""
-    low, high = steps(row[f"{name}_low"]), steps(row[f"{name}_high"])
-    return f"{steps(row[name])} ({low} to {high})" if low != "–" else steps(row[name])
+def span(value: float, low: float, high: float) -> str:
+    """A number of steps with its interval, as far as there is one."""
+    return steps(value) if pd.isna(low) else f"{steps(value)} ({steps(low)} to {steps(high)})"

@@ -20,6 +20,8 @@ from docs.markdown import number, p_value, span, steps, table
 NAMED = [cell.name for cell in CELLS.values() if cell.transfer == "named"]
 
 
+#: What is said of a comparison, with its interval.
+_DIFFERENCES = ("difference", "restricted_difference")
 #: What the picture shows, and what it calls it.
 _SHOWN = {"A0": "from nothing", "A2": "hidden layers, frozen", "N1": "by name"}
 #: Episodes that a point of its curves averages.
@@ -58,8 +60,7 @@ def tests(found: Analysis) -> str:
                 [
                     f"{row['index']} − {row['reference']}",
                     f"{row['runs_index']} + {row['runs_reference']}",
-                    span(row, "difference"),
-                    span(row, "restricted_difference"),
+                    *(span(*(row[f"{name}{end}"] for end in ("", "_low", "_high"))) for name in _DIFFERENCES),
                     *(p_value(row[name]) for name in ("p_permutation", "p_permutation_holm", "p_holm")),
                     number(chance["p_faster"], 2),
                 ]
@@ -98,6 +99,8 @@ def added(found: Analysis, published: Path) -> str:
                 *_evaluation(folder),
             ]
         )
+    if not rows:
+        return "No run of it is published yet."
     heads = ["seed", "teacher", "steps to threshold", "H0 of that seed", "then, mean return", "ended in a fall"]
     return table([*heads, "m/s"], rows)
 

@@ -27,7 +27,7 @@ from analysis.loading.speed import read_speed
 from analysis.report.published import side_by_side
 from analysis.report.write import figure_data
 from docs import named
-from docs.markdown import duration, number, p_value, steps, table
+from docs.markdown import duration, number, p_value, span, steps, table
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = (ROOT / "docs" / "results.md", ROOT / "docs" / "method.md")
@@ -136,14 +136,13 @@ def _comparisons(found: Analysis) -> str:
     for printed in side_by_side(found.table3).to_dict("records"):
         pair = (printed["reference"], printed["index"])
         row = ours[pair]
-        low, high = steps(row["difference_low"]), steps(row["difference_high"])
         rows.append(
             [
                 f"{pair[1]} − {pair[0]}",
                 *(number(printed["t_published"], 2), p_value(printed["p_published"])),
                 f"{row['runs_index']} + {row['runs_reference']}",
                 *(number(row["t_score"], 2), p_value(row["p_value"]), p_value(row["p_holm"])),
-                f"{steps(row['difference'])} ({low} to {high})" if low != "–" else "–",
+                span(row["difference"], row["difference_low"], row["difference_high"]),
                 *(p_value(row["p_permutation"]), p_value(row["p_log_rank"])),
             ]
         )
@@ -227,8 +226,7 @@ def _pair(row: dict[Hashable, Any]) -> str:
 
 
 def _difference(row: dict[Hashable, Any], name: str) -> str:
-    low, high = steps(row["low"]), steps(row["high"])
-    return f"{steps(row[name])} ({low} to {high})" if low != "–" else steps(row[name])
+    return span(row[name], row["low"], row["high"])
 
 
 def _interval(row: dict[Hashable, Any], name: str, digits: int) -> str:
