@@ -54,12 +54,17 @@ def teacher_factory(tmp_path: Path) -> Callable[..., Teacher]:
     """Makes teachers with random weights, saved and loaded as a user's would be."""
 
     def make(
-        dims: Dimensions, hidden_sizes: tuple[int, ...], seed: int = 99, core: Dimensions | None = None
+        dims: Dimensions,
+        hidden_sizes: tuple[int, ...],
+        seed: int = 99,
+        core: Dimensions | None = None,
+        log_std: str = "tanh",
     ) -> Teacher:
         low, high = np.full(dims.action, -1, np.float32), np.full(dims.action, 1, np.float32)
         architecture = replace(Architecture.plain(dims, hidden_sizes, low, high), core=core)
         networks = Networks(architecture, torch.Generator().manual_seed(seed))
-        folder = tmp_path / f"teacher-{dims.observation}-{dims.action}-{len(hidden_sizes)}-{seed}-{bool(core)}"
+        kind = f"{len(hidden_sizes)}-{seed}-{bool(core)}-{log_std}"
+        folder = tmp_path / f"teacher-{dims.observation}-{dims.action}-{kind}"
         folder.mkdir(exist_ok=True)
         description = TeacherDescription(
             format_version=FORMAT_VERSION, environment="made_up", environment_id="MadeUp-v0", model_hash="0" * 64,
@@ -67,7 +72,7 @@ def teacher_factory(tmp_path: Path) -> Callable[..., Teacher]:
             action_names=[f"action/{i}" for i in range(dims.action)],
             action_low=low.tolist(), action_high=high.tolist(), hidden_sizes=list(hidden_sizes),
             core=[core.observation, core.action] if core else None, adapter_activation="relu",
-            log_alpha=-1.5, seed=seed, profile="quick", global_step=1234, final_return=5.0, config={},
+            log_alpha=-1.5, seed=seed, profile="quick", global_step=1234, final_return=5.0, config={}, log_std=log_std,
         )  # fmt: skip
         save_teacher(folder, networks, description)
         return load_teacher(folder)

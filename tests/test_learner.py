@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from acmr.agent import precision as matmul_precision
-from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.architecture import LOG_STD_BOUNDS, Architecture, Dimensions
 from acmr.agent.kernels import arrays
 from acmr.agent.kernels.layers import CriticStack, Stack, columns
 from acmr.agent.kernels.parameters import Adam, FlatParameters
@@ -149,9 +149,10 @@ def test_layers_stay_the_truth_of_what_is_learned():
 
 @pytest.mark.parametrize("core", [None, CORE], ids=["plain", "adapted"])
 @pytest.mark.parametrize("devices", [{"cpu"}, set()], ids=["numpy", "torch"])
-def test_acting_is_the_networks_sample(core, devices, monkeypatch):
+@pytest.mark.parametrize("log_std", LOG_STD_BOUNDS)
+def test_acting_is_the_networks_sample(core, devices, log_std, monkeypatch):
     monkeypatch.setattr(arrays, "NUMPY_DEVICES", devices)
-    agent = make_agent(core)
+    agent = SAC(make_networks(core).with_log_std(log_std), CONFIG, generator(1), generator(2))
     draws = generator(1)
     for seed in range(20):
         observation = np.random.default_rng(seed).standard_normal(DIMS.observation)

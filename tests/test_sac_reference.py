@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.architecture import CLAMP, TANH, Architecture, Dimensions
 from acmr.agent.kernels import arrays
 from acmr.agent.networks import Networks
 from acmr.agent.precision import use_fast_float32
@@ -66,11 +66,16 @@ def make_batch(dims: Dimensions, seed: int, size: int) -> Batch:
     )
 
 
-def make_networks(cell: str, sizes: tuple[int, ...], teacher_factory: Callable, activation: str = "relu") -> Networks:
+def make_networks(
+    cell: str, sizes: tuple[int, ...], teacher_factory: Callable, activation: str = "relu", log_std: str = TANH
+) -> Networks:
     method, freeze, dims = CELLS[cell]
     high = np.full(dims.action, 0.4, np.float32)
     fresh = Networks(Architecture.plain(dims, sizes, -high, high), generator(5))
-    teacher = None if method == "none" else teacher_factory(SOURCE, sizes)
+    teacher = None if method == "none" else teacher_factory(SOURCE, sizes, log_std=log_std)
+    if method in ("none", "hidden"):
+        # Of no teacher they take the rule over.
+        fresh = fresh.with_log_std(log_std)
     config = TransferConfig(name=method, adapter_activation=activation, impute="zero")
     names = ([f"{kind}/{row}" for row in range(count)] for kind, count in
              (("obs", dims.observation), ("action", dims.action)))  # fmt: skip
@@ -148,10 +153,29 @@ def test_adapters_without_activation(teacher_factory):
 
 
 @pytest.mark.parametrize("cell", ["A0", "A2", "A3", "A4"])
-def test_the_code_path_of_a_gpu_takes_the_same_course(cell, teacher_factory, monkeypatch):
+@pytest.mark.parametrize("log_std", [TANH, CLAMP])
+def test_the_code_path_of_a_gpu_takes_the_same_course(cell, log_std, teacher_factory, monkeypatch):
     monkeypatch.setattr(arrays, "NUMPY_DEVICES", set())
     config = SACConfig(hidden_sizes=[64, 48], batch_size=96)
-    assert_same_course(lambda: make_networks(cell, (64, 48), teacher_factory), config, updates=40)
+    assert_same_course(lambda: make_networks(cell, (64, 48), teacher_factory, log_std=log_std), config, updates=40)
+
+
+@pytest.mark.usefixtures("_double")
+@pytest.mark.parametrize("cell", ["A0", "H1", "A3", "N1"])
+@pytest.mark.parametrize("bias", [0.0, 4.0])
+def test_a_clamped_log_std_takes_the_same_course(cell, bias, teacher_factory):
+    def make() -> Networks:
+        networks = make_networks(cell, (64, 48), teacher_factory, log_std=CLAMP)
+        assert networks.actor.log_std_rule == networks.architecture.log_std == CLAMP
+        head = networks.actor.log_std_adapter or networks.actor.log_std
+        with torch.no_grad():
+            # Some are far beyond a bound, where no gradient passes, some between them.
+            head.bias[::3] += 3 * bias
+            head.bias[1::3] -= 6 * bias
+        return networks
+
+    config = SACConfig(hidden_sizes=[64, 48], batch_size=96, kickstart=0.5, kickstart_updates=20)
+    assert_same_course(make, config, updates=60)
 
 
 @pytest.mark.usefixtures("_double")

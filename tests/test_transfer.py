@@ -11,14 +11,14 @@ import torch
 import yaml
 from guides import ROOT, copy_checkout, follow
 
-from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.architecture import CLAMP, TANH, Architecture, Dimensions
 from acmr.agent.networks import Networks
 from acmr.config import ConfigError, TransferConfig, TransferRules, differing_keys
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.run_spec import specify
 from acmr.transfer import methods
 from acmr.transfer.methods import METHODS, Student, Taken, method, transfer
-from acmr.transfer.teacher import load_teacher
+from acmr.transfer.teacher import load_teacher, save_teacher
 
 SOURCE, TARGET = Dimensions(12, 5), Dimensions(8, 3)
 SIZES = (10, 9)
@@ -188,6 +188,34 @@ def test_published_teachers_are_read_and_described_as_they_were():
         assert teacher.description.architecture.parameter_count == sum(map(torch.numel, teacher.tensors.values()))
         stored = json.loads((folder / "teacher.json").read_text())
         assert asdict(teacher.description) == {**asdict(teacher.description), **stored, "description_sha256": ""}
+
+
+@pytest.mark.parametrize(
+    ("name", "dims"), [("direct", SOURCE), ("expand", TARGET), ("named", TARGET), ("hidden", TARGET)]
+)
+def test_the_bounds_of_log_std_go_where_its_head_goes(name, dims, teacher_factory):
+    clamped, squashed = (teacher_factory(SOURCE, SIZES, log_std=rule) for rule in (CLAMP, TANH))
+    # What is the default is not written: files are as they were, and older ones still read.
+    assert "log_std" not in json.loads(squashed.path.with_suffix(".json").read_text())
+    assert clamped.description.architecture.log_std == CLAMP
+    networks, report = run(dims, clamped, name, impute="zero")
+    before, _ = run(dims, squashed, name, impute="zero")
+    taken = name != "hidden"
+    assert (networks.architecture.log_std == CLAMP) == taken == (networks.actor.log_std_rule == CLAMP)
+    assert ("log_std is bounded as in the teacher (clamp)" in report.notes) == taken
+    seen = torch.randn(4, dims.observation, generator=torch.Generator().manual_seed(3))
+    mean, raw = networks.actor.outputs(seen)
+    torch.testing.assert_close(networks.actor(seen)[1], raw.clamp(-20, 2) if taken else before.actor(seen)[1])
+    assert torch.equal(mean, before.actor.outputs(seen)[0])
+    assert before.architecture.log_std == TANH
+
+
+def test_an_unknown_temperature_is_not_copied(teacher_factory):
+    teacher = teacher_factory(SOURCE, SIZES)
+    assert teacher.log_alpha() == -1.5
+    save_teacher(teacher.path.parent, teacher.build_networks(), replace(teacher.description, log_alpha=None))
+    with pytest.raises(ConfigError, match=r"imported without a temperature .* type transfer.copy_log_alpha=false"):
+        load_teacher(teacher.path).log_alpha()
 
 
 def test_every_method_has_a_yaml_file_and_the_other_way_round():

@@ -15,6 +15,10 @@ import numpy as np
 ACTOR, CRITICS = "actor", ("critic_1", "critic_2")
 #: Layers that translate between a student's dimensions and its teacher's.
 ADAPTERS = ("input_adapter", "mean_adapter", "log_std_adapter")
+#: How a log standard deviation is brought within its bounds: squashed (CleanRL) or clamped (Stable-Baselines3).
+TANH, CLAMP = "tanh", "clamp"
+#: The bounds.
+LOG_STD_BOUNDS = {TANH: (-5.0, 2.0), CLAMP: (-20.0, 2.0)}
 #: Inputs and outputs of a linear layer.
 Shape = tuple[int, int]
 
@@ -41,6 +45,8 @@ class Architecture:
         action_high: Greatest value of each action.
         core: Sizes of a teacher's environment where the teacher's layers lie between adapters, else None.
         adapter_activation: ``relu`` or ``none``, between the input adapter and the teacher's first layer.
+        log_std: How the policy's log standard deviation is bounded, ``tanh`` or ``clamp``. No linear layer makes one of
+            the other, so that it belongs to the heads of a policy, wherever they are copied to.
     """
 
     dims: Dimensions
@@ -49,6 +55,7 @@ class Architecture:
     action_high: tuple[float, ...]
     core: Dimensions | None = None
     adapter_activation: str = "relu"
+    log_std: str = TANH
 
     @classmethod
     def plain(cls, dims: Dimensions, hidden_sizes: Sequence[int], low: np.ndarray, high: np.ndarray) -> Architecture:

@@ -10,10 +10,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from acmr.agent.architecture import ACTOR, ADAPTERS, CRITICS, Architecture, Dimensions, Shape, is_hidden
+from acmr.agent.architecture import (
+    ACTOR,
+    ADAPTERS,
+    CLAMP,
+    CRITICS,
+    LOG_STD_BOUNDS,
+    Architecture,
+    Dimensions,
+    Shape,
+    is_hidden,
+)
 
-#: Bounds of the log standard deviation that the policy can express (reference implementation: CleanRL).
-LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
@@ -96,6 +104,7 @@ class Actor(Trunk):
         # Not persistent: a teacher's file holds what was learned, and its description the bounds.
         self.register_buffer("action_scale", (high - low) / 2.0, persistent=False)
         self.register_buffer("action_bias", (high + low) / 2.0, persistent=False)
+        self.log_std_rule = architecture.log_std
 
     def outputs(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """What the heads say: the mean, and the log standard deviation before it is bounded, each (batch, action)."""
@@ -108,7 +117,10 @@ class Actor(Trunk):
     def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation before squashing, each (batch, action)."""
         mean, raw = self.outputs(observations)
-        return mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(raw) + 1.0)
+        least, most = LOG_STD_BOUNDS[self.log_std_rule]
+        if self.log_std_rule == CLAMP:
+            return mean, raw.clamp(least, most)
+        return mean, least + 0.5 * (most - least) * (torch.tanh(raw) + 1.0)
 
     def sample(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Actions by reparameterization and their log-probabilities.
@@ -186,3 +198,12 @@ class Networks(nn.Module):
     def with_core(self, core: Dimensions | None, adapter_activation: str, generator: torch.Generator) -> Networks:
         """Fresh networks for the same environment around the layers of another one."""
         return Networks(replace(self.architecture, core=core, adapter_activation=adapter_activation), generator)
+
+    def with_log_std(self, rule: str) -> Networks:
+        """The same weights in a policy whose log standard deviation is bounded by another rule."""
+        if rule == self.architecture.log_std:
+            return self
+        # Its weights are drawn only to be overwritten: no run's generator is to notice.
+        other = Networks(replace(self.architecture, log_std=rule), torch.Generator().manual_seed(0))
+        other.load_state_dict(self.state_dict())
+        return other

@@ -93,10 +93,11 @@ class SAC:
         self._actor = Stack(self._actor_parameters.blocks, relus(actor))
         self._critics = CriticStack(self._critic_parameters.blocks, active, dims.observation)
         self._targets = CriticStack(self._target_parameters.blocks, active, dims.observation)
-        self._policy = SquashedGaussian(actor.action_scale, actor.action_bias)
+        bounded = (actor.action_scale, actor.action_bias, actor.log_std_rule)
+        self._policy = SquashedGaussian(*bounded)
         in_numpy = self._math is np
         acting = Stack(self._actor_parameters.masters, relus(actor)).layers
-        self._acting = NumpyPolicy(acting, actor.action_scale, actor.action_bias) if in_numpy else None
+        self._acting = NumpyPolicy(acting, *bounded) if in_numpy else None
 
     @torch.no_grad()
     def act(self, observation: np.ndarray) -> np.ndarray:

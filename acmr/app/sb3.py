@@ -11,6 +11,7 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor, nn
 
+from acmr.agent.architecture import TANH
 from acmr.agent.networks import Actor, Critic, Trunk
 from acmr.transfer.teacher import Teacher
 
@@ -28,8 +29,8 @@ class _Spaces(gym.Env[np.ndarray, np.ndarray]):
 def write_sb3(teacher: Teacher, path: Path) -> None:
     """Writes a model for ``stable_baselines3.SAC.load``: actor, critics, targets and temperature.
 
-    Its deterministic actions and its Q values are those of the networks. Its sampled actions are not: its standard
-    deviation is a clamped linear function of the last features where ours is a tanh; it gets the tangent at the middle.
+    Its deterministic actions and its Q values are those of the networks. Its sampled actions are so where log_std is
+    clamped, as it is there; of one that is a tanh it gets the tangent at the middle.
     """
     # Not installed with the program; the caller has seen that it is there.
     from stable_baselines3 import SAC
@@ -50,13 +51,15 @@ def write_sb3(teacher: Teacher, path: Path) -> None:
     _fill(model.actor.latent_pi, trunk)
     mean, raw = _heads(networks.actor)
     _fill([model.actor.mu], [mean])
-    # log_std = -5 + 3.5 (tanh(raw) + 1) = -1.5 + 3.5 raw + ... at raw = 0.
-    _fill([model.actor.log_std], [(3.5 * raw[0], 3.5 * raw[1] - 1.5)])
+    if about.log_std == TANH:
+        # log_std = -5 + 3.5 (tanh(raw) + 1) = -1.5 + 3.5 raw + ... at raw = 0.
+        raw = (3.5 * raw[0], 3.5 * raw[1] - 1.5)
+    _fill([model.actor.log_std], [raw])
     for critic in (model.critic, model.critic_target):
         for network, ours in zip(critic.q_networks, networks.critics, strict=True):
             _fill(network, _q_layers(ours, networks.actor, about.dims.observation))
     with torch.no_grad():
-        model.log_ent_coef.fill_(about.log_alpha)
+        model.log_ent_coef.fill_(0.0 if about.log_alpha is None else about.log_alpha)
     model.save(path)
 
 

@@ -38,4 +38,4 @@ def policy_in(teacher: Teacher, config: EnvConfig, impute: str, trust: bool = Fa
     student = Student(fresh, about.observation_names, about.action_names)
     told = teacher if impute == ZERO else with_statistics(teacher, "type --trust, or --impute zero", trust)
     taken = named(student, told, TransferConfig(name="named", impute=impute), generator)
-    return taken.networks.actor.eval(), taken.lines
+    return taken.networks.with_log_std(learned.log_std).actor.eval(), taken.lines

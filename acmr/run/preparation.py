@@ -76,8 +76,7 @@ def prepare(spec: RunSpec) -> Prepared:
     fresh = Networks(architecture, streams.networks)
     student = Student(fresh, about.observation_names, about.action_names)
     transferred = transfer(student, teacher, config.transfer, config.freeze, streams.networks)
-    copied_alpha = teacher is not None and config.transfer.copy_log_alpha
-    log_alpha = teacher.description.log_alpha if teacher is not None and copied_alpha else 0.0
+    log_alpha = teacher.log_alpha() if teacher is not None and config.transfer.copy_log_alpha else 0.0
     return Prepared(
         spec=spec,
         about=about,

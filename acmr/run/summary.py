@@ -99,6 +99,7 @@ def describe_teacher(
         global_step=summary["global_step"],
         final_return=summary["final_return"],
         config=json.loads(json.dumps(portable_settings(spec.settings))),
+        log_std=made.log_std,
         statistics=_statistics(spec, agent, say),
     )
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from acmr.agent.architecture import Architecture, Dimensions
+from acmr.agent.architecture import LOG_STD_BOUNDS, TANH, Architecture, Dimensions
 from acmr.config import ACTIVATIONS, ConfigError
 from acmr.foreign import DESCRIPTIONS, read_mapping
 from acmr.records import DamagedError, description_sha256
@@ -19,7 +19,7 @@ _READABLE = (1, FORMAT_VERSION)
 #: What numbers a tensor file may hold: those of a run, and those of one that is published in half the bytes.
 FULL, HALF = "float32", "float16"
 #: Entries of a description that are written only where they say something.
-_OPTIONAL = ("precision", "full_sha256", "statistics")
+_OPTIONAL = ("precision", "full_sha256", "statistics", "log_std", "imported")
 #: Layers wider than this are none of ours.
 _MAX_WIDTH = 1 << 20
 
@@ -63,7 +63,7 @@ class TeacherDescription:
         hidden_sizes: Widths of the hidden layers.
         core: Observation and action dimension of its inner layers where adapters surround them, else None.
         adapter_activation: Activation behind the input adapter.
-        log_alpha: Log of the final temperature.
+        log_alpha: Log of the final temperature; None where it is not known, or is one of other actions.
         seed: Seed of the run.
         profile: Profile of the run.
         global_step: Environment steps it was trained for.
@@ -74,6 +74,8 @@ class TeacherDescription:
         description_sha256: Of all other entries of this description.
         precision: Of the numbers in the tensor file.
         full_sha256: Of the tensor file in full precision that this one was rounded from; empty for a full one.
+        log_std: How the policy's log standard deviation is bounded, ``tanh`` or ``clamp``.
+        imported: Of networks that another program trained, which program; empty for those of a run.
     """
 
     format_version: int
@@ -87,7 +89,7 @@ class TeacherDescription:
     hidden_sizes: list[int]
     core: list[int] | None
     adapter_activation: str
-    log_alpha: float
+    log_alpha: float | None
     seed: int
     profile: str
     global_step: int
@@ -98,6 +100,8 @@ class TeacherDescription:
     description_sha256: str = ""
     precision: str = FULL
     full_sha256: str = ""
+    log_std: str = TANH
+    imported: str = ""
 
     @property
     def dims(self) -> Dimensions:
@@ -114,6 +118,7 @@ class TeacherDescription:
             tuple(self.action_high),
             Dimensions(*self.core) if self.core else None,
             self.adapter_activation,
+            self.log_std,
         )
 
 
@@ -173,13 +178,14 @@ def _wrong_entries(about: TeacherDescription) -> list[str]:
     if not all(names.values()):
         # All others are judged by how many there are.
         return [name for name, is_good in names.items() if not is_good]
-    texts = ("environment", "environment_id", "model_hash", "profile", "sha256", "full_sha256")
+    texts = ("environment", "environment_id", "model_hash", "profile", "sha256", "full_sha256", "imported")
     good = {
         "action_low": bounds(about.action_low),
         "action_high": bounds(about.action_high),
         "hidden_sizes": widths(about.hidden_sizes),
         "core": about.core is None or (widths(about.core) and len(about.core) == 2),
-        "log_alpha": finite(about.log_alpha),
+        "log_alpha": about.log_alpha is None or finite(about.log_alpha),
+        "log_std": isinstance(about.log_std, str) and about.log_std in LOG_STD_BOUNDS,
         "seed": type(about.seed) is int,
         "global_step": type(about.global_step) is int,
         "final_return": about.final_return is None or finite(about.final_return),

@@ -121,6 +121,7 @@ def transfer(
     taken = take(student, teacher, config, generator)
     if teacher is not None and not (taken.copied or taken.fitted):
         raise ConfigError(f"transfer={config.name}: no layer of {teacher.path} could be copied")
+    taken = _bound_alike(taken, teacher)
     layers = taken.networks.layers()
     frozen = [name for name in layers if freeze and name in taken.copied]
     for name in frozen:
@@ -129,6 +130,18 @@ def transfer(
     report = report_transfer(taken.networks, teacher, config, freeze, (taken.copied, taken.fitted, frozen))
     report = replace(report, details=taken.details, notes=taken.lines)
     return Transferred(taken.networks, report, Audition(taken.choices))
+
+
+def _bound_alike(taken: Taken, teacher: Teacher | None) -> Taken:
+    """Bounds log_std as the teacher does, where its head was taken: else the same weights say something else."""
+    names = (name.split(".")[-1] for name in (*taken.copied, *taken.fitted))
+    if teacher is None or "log_std" not in names:
+        return taken
+    networks = taken.networks.with_log_std(teacher.description.log_std)
+    if networks is taken.networks:
+        return taken
+    details, line = taken.details | {"log_std": networks.architecture.log_std}, "log_std is bounded as in the teacher"
+    return replace(taken, networks=networks, details=details, lines=[*taken.lines, f"{line} ({details['log_std']})"])
 
 
 @method("none")

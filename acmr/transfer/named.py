@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from acmr.agent.architecture import ACTOR, CRITICS
+from acmr.agent.architecture import ACTOR, CLAMP, CRITICS, LOG_STD_BOUNDS, TANH
 from acmr.agent.networks import Networks
 from acmr.config import AUTO, INITIAL, MEAN, ZERO, ConfigError, TransferConfig, share_of_mean
 from acmr.transfer.audition import Biases
@@ -132,6 +132,9 @@ def fit_heads(networks: Networks, teacher: Teacher, actuators: PartMap) -> list[
     for name in fitted:
         layer = networks.layers()[name]
         weight, bias = SMALL * layer.weight.detach(), torch.zeros_like(layer.bias)
+        if name.endswith(("log_std", "log_std_adapter")) and teacher.description.log_std == CLAMP:
+            # Where the middle of the other rule lies, at which an added actuator begins.
+            bias += sum(LOG_STD_BOUNDS[TANH]) / 2
         for ours, kind in ((weight, "weight"), (bias, "bias")):
             ours[list(actuators.ours)] = teacher.tensors[f"{name}.{kind}"][list(actuators.theirs)].to(ours.dtype)
         _put(layer, weight, bias)

@@ -16,6 +16,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
+from acmr.agent.architecture import TANH
 from acmr.agent.networks import Networks
 from acmr.config import ConfigError
 from acmr.foreign import NETWORKS, is_there, read_bytes
@@ -38,6 +39,19 @@ class Teacher:
         networks = Networks(self.description.architecture, torch.Generator().manual_seed(0))
         networks.load_state_dict(self.tensors)
         return networks
+
+    def log_alpha(self) -> float:
+        """Log of its temperature, for a student that begins with it (``transfer.copy_log_alpha``).
+
+        Raises:
+            ConfigError: If it has none that means the same here.
+        """
+        if self.description.log_alpha is None:
+            raise ConfigError(
+                f"transfer.copy_log_alpha=true: {self.path} was imported without a temperature that means the same "
+                "here (docs/exchange.md); type transfer.copy_log_alpha=false"
+            )
+        return self.description.log_alpha
 
 
 def save_teacher(folder: Path, networks: Networks, description: TeacherDescription) -> None:
@@ -66,6 +80,10 @@ def _write(folder: Path, tensors: dict[str, Tensor], description: TeacherDescrip
         del content["precision"], content["full_sha256"]
     if description.statistics is None:
         del content["statistics"]
+    if description.log_std == TANH:
+        del content["log_std"]
+    if not description.imported:
+        del content["imported"]
     content["description_sha256"] = description_sha256(content)
     # The description last: it names the hash of the tensors, so a kill in between leaves a pair that is refused.
     write_bytes(folder / TENSOR_FILE, data)

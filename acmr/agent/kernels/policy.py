@@ -9,26 +9,30 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from acmr.agent.architecture import CLAMP, LOG_STD_BOUNDS, TANH
 from acmr.agent.kernels.arrays import Array, array_of, math_of, tensor_of
 from acmr.agent.kernels.layers import Dense
-from acmr.agent.networks import LOG_STD_MAX, LOG_STD_MIN
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 # log_std = low + (high - low) / 2 (tanh(raw) + 1), as center and reach (CleanRL).
-_CENTER, _REACH = 0.5 * (LOG_STD_MAX + LOG_STD_MIN), 0.5 * (LOG_STD_MAX - LOG_STD_MIN)
+_LOW, _HIGH = LOG_STD_BOUNDS[TANH]
+_CENTER, _REACH = 0.5 * (_HIGH + _LOW), 0.5 * (_HIGH - _LOW)
 #: Keeps the logarithm of the squashing finite (CleanRL).
 _SMALL = 1e-6
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Actions, (batch, action), their log-probabilities, (batch,), and what the gradient needs of the way there."""
+    """Actions, (batch, action), their log-probabilities, (batch,), and what the gradient needs of the way there.
+
+    ``bend`` is what the slope of log_std follows from: tanh(raw) where it is squashed, that slope where it is clamped.
+    """
 
     actions: Array
     log_prob: Array
     noise: Array
     std: Array
-    tanh_raw: Array
+    bend: Array
     squashed: Array
     slope: Array
 
@@ -39,10 +43,12 @@ class SquashedGaussian:
     Args:
         scale: Half the width of each action's range, (action,).
         bias: Its middle, (action,).
+        log_std: How log_std is bounded, ``tanh`` or ``clamp``.
     """
 
-    def __init__(self, scale: Tensor, bias: Tensor) -> None:
+    def __init__(self, scale: Tensor, bias: Tensor, log_std: str = TANH) -> None:
         self._math = math_of(scale)
+        self._clamped = log_std == CLAMP
         self._scale, self._bias = array_of(scale), array_of(bias)
 
     def sample(self, mean: Array, raw: Array, noise: Array) -> Sample:
@@ -53,8 +59,13 @@ class SquashedGaussian:
             raw: Its log_std before it is brought within bounds, (batch, action).
             noise: Standard normal draws, (batch, action).
         """
-        tanh_raw = self._math.tanh(raw)
-        log_std = tanh_raw * _REACH + _CENTER
+        if self._clamped:
+            log_std = self._math.clip(raw, *LOG_STD_BOUNDS[CLAMP])
+            # As autograd has it: at a bound itself the gradient still passes.
+            bend = (log_std == raw) * self._math.ones_like(raw)
+        else:
+            bend = self._math.tanh(raw)
+            log_std = bend * _REACH + _CENTER
         std = self._math.exp(log_std)
         # torch's tanh on either device: near +-1 its last bit decides 1 - tanh^2, so it is the one of the networks.
         squashed = array_of(tensor_of(std * noise + mean).tanh_())
@@ -63,10 +74,9 @@ class SquashedGaussian:
         slope = (1.0 - squashed * squashed) * self._scale
         less = self._math.log(slope + _SMALL) + log_std + noise * noise * 0.5 + _HALF_LOG_2PI
         actions = squashed * self._scale + self._bias
-        return Sample(actions, -less.sum(1), noise, std, tanh_raw, squashed, slope)
+        return Sample(actions, -less.sum(1), noise, std, bend, squashed, slope)
 
-    @staticmethod
-    def backward(sample: Sample, of_actions: Array, of_log_prob: Array, of_mean: Array, of_raw: Array) -> None:
+    def backward(self, sample: Sample, of_actions: Array, of_log_prob: Array, of_mean: Array, of_raw: Array) -> None:
         """Writes the gradient of the actor's output.
 
         With x the Gaussian's draw, t = tanh(x) and s = scale (1 - t^2) = da/dx: dx = s (da + 2 t dlp / (s + 1e-6)).
@@ -80,10 +90,13 @@ class SquashedGaussian:
         """
         # x = mean + std noise, so dmean = dx and dlog_std = dx std noise; log pi also has -log_std itself, by which its
         # gradient is -1. The noise is a constant here, as reparameterization has it.
-        bend = sample.squashed / (sample.slope + _SMALL) * (2.0 * of_log_prob)
-        of_mean[...] = (bend + of_actions) * sample.slope
+        pull = sample.squashed / (sample.slope + _SMALL) * (2.0 * of_log_prob)
+        of_mean[...] = (pull + of_actions) * sample.slope
         of_log_std = of_mean * sample.std * sample.noise - of_log_prob
-        of_raw[...] = of_log_std * (1.0 - sample.tanh_raw * sample.tanh_raw) * _REACH
+        if self._clamped:
+            of_raw[...] = of_log_std * sample.bend
+        else:
+            of_raw[...] = of_log_std * (1.0 - sample.bend * sample.bend) * _REACH
 
 
 class NumpyPolicy:
@@ -95,11 +108,13 @@ class NumpyPolicy:
         layers: The actor's layers, on the CPU.
         scale: Half the width of each action's range, (action,).
         bias: Its middle, (action,).
+        log_std: How log_std is bounded, ``tanh`` or ``clamp``.
     """
 
-    def __init__(self, layers: Sequence[Dense], scale: Tensor, bias: Tensor) -> None:
+    def __init__(self, layers: Sequence[Dense], scale: Tensor, bias: Tensor, log_std: str = TANH) -> None:
         self._layers = [(layer.weight.numpy(), layer.bias.numpy(), layer.relu) for layer in layers]
         self._scale, self._bias = scale.numpy(), bias.numpy()
+        self._clamped = log_std == CLAMP
 
     def __call__(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """The action, (action,), for an observation (observation,) and standard normal draws (action,)."""
@@ -114,6 +129,9 @@ class NumpyPolicy:
             if relu:
                 np.maximum(hidden, 0.0, out=hidden)
         mean, raw = hidden.reshape(2, -1)
-        std = np.exp(np.tanh(raw) * np.float32(_REACH) + np.float32(_CENTER))
+        if self._clamped:
+            std = np.exp(raw.clip(*LOG_STD_BOUNDS[CLAMP]))
+        else:
+            std = np.exp(np.tanh(raw) * np.float32(_REACH) + np.float32(_CENTER))
         action: np.ndarray = np.tanh(mean + std * noise) * self._scale + self._bias
         return action
