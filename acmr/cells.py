@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from acmr.config import STOP_KEYS, TransferConfig
+from acmr.config import INDEPENDENT, STOP_KEYS, TransferConfig
 
 #: Environments of a profile's pair, by what they are in a transfer.
 SOURCE, TARGET = "source", "target"
@@ -23,8 +23,12 @@ REFERENCE = "A0"
 
 _LONGEST_NAME = 120
 _PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,32}")
+#: Settings that say which run of a cell it is, like its seed, and not which cell: when it ends, how it uses its seed.
+_OF_NO_CELL = (*STOP_KEYS, "seeding")
 #: How a name says that the run stops at its threshold.
 _STOP = re.compile(r"-stop=threshold(-stop_after=\d+)?(?=-|$)")
+#: How a name says that the run draws from random numbers of its own.
+_SEEDING = re.compile(rf"-seeding={INDEPENDENT}(?=-|$)")
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ CELLS = {
 
 
 def cell_of(role: str | None, transfer: str, freeze: bool, changes: Mapping[str, Any]) -> str | None:
-    """The cell that a run belongs to, if there is one; where the run stops does not matter.
+    """The cell that a run belongs to, if there is one; where the run stops and how it uses its seed do not matter.
 
     Args:
         role: What its environment is in its profile's pair; None: neither source nor target.
@@ -90,8 +94,7 @@ def cell_of(role: str | None, transfer: str, freeze: bool, changes: Mapping[str,
         freeze: Whether it freezes what it took.
         changes: All settings, as ``group.key``, in which it differs from its profile's own.
     """
-    defining = {key: value for key, value in changes.items() if key not in STOP_KEYS}
-    meant = (role, transfer, freeze, defining)
+    meant = (role, transfer, freeze, without_kind(changes))
     found = (cell for cell in CELLS.values() if (cell.role, cell.transfer, cell.freeze, cell.changes) == meant)
     return next((cell.name for cell in found), None)
 
@@ -122,14 +125,24 @@ def run_name(env: str, transfer: str, freeze: bool, changes: Mapping[str, Any]) 
     return name if len(name) <= _LONGEST_NAME else "-".join([*parts, digest(said)])
 
 
+def without_kind(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Of the settings in which a run differs from its profile those that more than its own seed depends on."""
+    return {key: value for key, value in changes.items() if key not in _OF_NO_CELL}
+
+
 def stops(name: str) -> bool:
     """Whether a run of this name ends at its threshold."""
     return _STOP.search(name) is not None
 
 
-def full_name(name: str) -> str:
-    """The name of the run that takes all steps, of which the run of this name is the beginning or the whole."""
-    return _STOP.sub("", name)
+def draws_apart(name: str) -> bool:
+    """Whether a run of this name draws from random numbers of its own (``seeding=independent``)."""
+    return _SEEDING.search(name) is not None
+
+
+def plain_name(name: str) -> str:
+    """The name of runs like this one, whether or not they stop at the threshold and however they use their seeds."""
+    return _SEEDING.sub("", _STOP.sub("", name))
 
 
 def digest(value: object) -> str:

@@ -1,4 +1,4 @@
-"""The settings of one run: their types, and in which of them two runs differ.
+"""The settings of one run: their types, and which of them matter to what.
 
 Values live in ``conf/``; this module gives them types. Nothing here knows where a value came from
 (:mod:`acmr.settings.compose`) or which ones can be run (:mod:`acmr.settings.validate`).
@@ -26,6 +26,10 @@ TEACHER_CHOICE = ("transfer.teacher", "transfer.teacher_seeds")
 HORIZON, THRESHOLD = "horizon", "threshold"
 #: Settings that can only cut a run short: what it does until then stays the same, and so does the paper's cell.
 STOP_KEYS = ("stop", "stop_after")
+
+#: How runs of one seed are related: they share its random numbers, or each cell draws from numbers of its own.
+PAIRED, INDEPENDENT = "paired", "independent"
+SEEDINGS = (PAIRED, INDEPENDENT)
 
 PROGRESS_MODES = ("auto", "bar", "lines", "off")
 #: How matrix products are computed.
@@ -213,6 +217,9 @@ class ExperimentConfig:
 
     #: Of every random number of the run, 0 to 2**53 - 1. A teacher that no path names is the one with the same seed.
     seed: int = 1
+    #: How it is used, a file in ``conf/seeding``: runs of one seed are ``paired`` (they share environment seed, random
+    #: first actions and fresh weights) or ``independent`` (streams from the seed and the run's name).
+    seeding: str = PAIRED
     #: Whether what is copied from the teacher stays as it is.
     freeze: bool = False
     #: Environment steps that the run takes.
@@ -282,19 +289,3 @@ def schema_defaults() -> dict[str, Any]:
 def is_neutral(key: str) -> bool:
     """Whether a setting cannot change what a run computes."""
     return key.split(".")[0] in NEUTRAL_KEYS
-
-
-def differing_keys(stored: Mapping[str, Any], config: ExperimentConfig) -> list[str]:
-    """Settings, of those that change the result, in which a stored run differs from this one.
-
-    A setting that the stored run knew nothing of has the schema's default: one that is added to the schema must default
-    to what was done before, and then orphans no run. One that only the stored run knows did something that cannot be
-    done any more, so it counts as a difference, unless it was null: not set.
-    """
-    before, now = schema_defaults() | flatten(stored), flatten(plain_settings(config))
-    return [
-        key
-        for key in sorted(set(before) | set(now))
-        # One teacher may be reached in several ways; the run's name identifies it by its content.
-        if not is_neutral(key) and key not in TEACHER_CHOICE and before.get(key) != now.get(key)
-    ]

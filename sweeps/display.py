@@ -13,6 +13,7 @@ from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
+from acmr.cells import stops
 from acmr.command import PROGRAM
 from acmr.names import terminal
 from acmr.records import COMPLETE, DIVERGED, ENDED, FAILED, RUNNING, STOPPED
@@ -188,7 +189,9 @@ def _sentence(view: RunStatus, detail: str) -> str:
 
 def _remark(run: PlannedRun) -> str:
     if run.stands_for:
-        why = "in full, and there" if run.ended else "in full, since it teaches"
+        # A run that no other stands for is not full because of this one.
+        full = "in full, " if any(stops(name) for name in run.stands_for) else ""
+        why = f"{full}and there" if run.ended else f"{full}since it teaches"
         return f"  ({why}: stands for {', '.join(run.stands_for)})"
     return "  (added: the teacher of runs below)" if run.implied else ""
 

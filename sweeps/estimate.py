@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.cells import full_name
+from acmr.cells import plain_name
 from acmr.config import THRESHOLD, ExperimentConfig
 from acmr.envs import describe
 from acmr.records import COMPLETE, SUMMARY_FILE, ended_state
@@ -87,7 +87,7 @@ def _speeds(finished: Mapping[Path, Mapping[str, Any]]) -> dict[_Kind, list[floa
     found: dict[_Kind, list[float]] = {}
     for directory, summary in finished.items():
         if speed := summary.get("steps_per_second"):
-            kind = (directory.parts[-3], full_name(directory.parts[-2]))
+            kind = (directory.parts[-3], plain_name(directory.parts[-2]))
             found.setdefault(kind, []).append(float(speed))
     return found
 
@@ -102,7 +102,7 @@ def _lengths(finished: Mapping[Path, Mapping[str, Any]]) -> Lengths:
 
 def _models(run: PlannedRun, speeds: dict[_Kind, list[float]]) -> list[_Kind]:
     """Whose speed a run is expected to have: its own with other seeds, else for want of better its whole profile."""
-    profile, same = run.spec.config.profile, (run.spec.config.profile, full_name(run.spec.name))
+    profile, same = run.spec.config.profile, (run.spec.config.profile, plain_name(run.spec.name))
     return [same] if same in speeds else [kind for kind in speeds if kind[0] == profile]
 
 

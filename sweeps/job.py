@@ -48,7 +48,8 @@ _SET_DEATH_SIGNAL = 1
 
 def write_job(path: Path, spec: RunSpec) -> None:
     """Stores a run with everything that follows from its settings, so that it needs no settings file any more."""
-    content = {"config": asdict(spec.config), "changes": spec.changes, "name": spec.name, "cell": spec.cell}
+    named = {"name": spec.name, "cell": spec.cell, "kin": spec.kin}
+    content = {"config": asdict(spec.config), "changes": spec.changes, **named}
     write_json(path, content)
 
 
@@ -57,7 +58,7 @@ def read_job(path: Path) -> RunSpec:
     content = json.loads(read_regular(path, _MOST_BYTES))
     config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ExperimentConfig), content["config"]))
     assert isinstance(config, ExperimentConfig)
-    return RunSpec(config, content["changes"], content["name"], content["cell"])
+    return RunSpec(config, content["changes"], content["name"], content["cell"], content["kin"])
 
 
 def adopt(path: Path) -> tuple[RunSpec, Callable[[], None]]:

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
-from acmr.config import HORIZON, THRESHOLD, ConfigError, ExperimentConfig
+from acmr.config import HORIZON, INDEPENDENT, PAIRED, THRESHOLD, ConfigError, ExperimentConfig
 from acmr.records import COMPLETE, ended_state
 from acmr.settings.compose import compose_config, parse
 from acmr.settings.errors import check_booleans
@@ -16,6 +17,8 @@ from acmr.storage.run_dir import RunDir, holds_run
 
 #: Settings that a teacher takes over from its student because they change nothing in its result.
 _SHARED_KEYS = ("device", "threads", "progress", "log_every", "tracking", "checkpoint_every", "resume")
+#: Of the run that another is the beginning of.
+_FULL: dict[str, Any] = {"stop": HORIZON, "stop_after": None}
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,7 @@ class PlannedRun:
         ended: ``complete`` or ``diverged``, if it is there already.
         teacher: Index of the run that has to be complete before this one starts.
         implied: Whether it was not asked for, but is the teacher of a run that was.
-        stands_for: Names of runs that were asked for and stop early, of which it is the full one.
+        stands_for: Names of runs that were asked for and need not be made where it is.
     """
 
     index: int
@@ -102,7 +105,7 @@ def make_plan(specs: Sequence[RunSpec]) -> Plan:
     """Adds the teachers that students imply, and finds out what is there already.
 
     A run that stops at its threshold is not made where the full one, whose beginning it is, teaches another of them or
-    is there already.
+    is there already; nor one with ``seeding=independent`` where it would be trained beside the teacher of the others.
 
     Args:
         specs: Runs in different directories.
@@ -110,12 +113,12 @@ def make_plan(specs: Sequence[RunSpec]) -> Plan:
     Raises:
         ConfigError: If a directory holds a run with other settings, or if a teacher that is named is not there.
     """
-    full_runs = _full_runs(specs)
+    stand_ins = _stand_ins(specs)
     stands_for: dict[Path, tuple[str, ...]] = {}
     for spec in specs:
-        if (full := full_runs.get(spec.directory)) is not None:
-            stands_for[full.directory] = (*stands_for.get(full.directory, ()), spec.name)
-    specs = [full_runs.get(spec.directory, spec) for spec in specs]
+        if (other := stand_ins.get(spec.directory)) is not None:
+            stands_for[other.directory] = (*stands_for.get(other.directory, ()), spec.name)
+    specs = [stand_ins.get(spec.directory, spec) for spec in specs]
     listed = {spec.directory: spec for spec in specs}
     ended = {directory: _ended(spec) for directory, spec in listed.items()}
     # A student that is there needs no teacher any more, even where that was deleted.
@@ -143,19 +146,20 @@ def make_plan(specs: Sequence[RunSpec]) -> Plan:
     return Plan(tuple(runs))
 
 
-def _full_runs(specs: Sequence[RunSpec]) -> dict[Path, RunSpec]:
-    """For the directory of each run that stops: the full one, if that teaches a run of the sweep or is complete.
+def _stand_ins(specs: Sequence[RunSpec]) -> dict[Path, RunSpec]:
+    """For the directory of a run that need not be made: the run that stands for it.
 
+    That is the full one of a run that stops, if it teaches a run of the sweep or is complete; and of a run with
+    ``seeding=independent`` the one that teaches others of them: it draws from the seed alone, as none of these do.
     Students that are complete count, too: the same command means the same runs when it is typed again.
     """
-    full = {
-        spec.directory: specify(replace(spec.config, stop=HORIZON, stop_after=None))
-        for spec in specs
-        if spec.config.stop == THRESHOLD
-    }
-    students = [spec for spec in specs if full and spec.config.transfer.rules.needs_teacher]
+    full = {spec.directory: specify(replace(spec.config, **_FULL)) for spec in specs if spec.config.stop == THRESHOLD}
+    apart = [spec for spec in specs if spec.config.seeding == INDEPENDENT]
+    paired = {spec.directory: specify(replace(spec.config, **_FULL, seeding=PAIRED)) for spec in apart}
+    students = [spec for spec in specs if (full or paired) and spec.config.transfer.rules.needs_teacher]
     teaching = {teacher_spec(spec.config).directory for spec in students if spec.config.transfer.teacher is None}
-    return {place: spec for place, spec in full.items() if spec.directory in teaching or _is_there(spec)}
+    found = {place: spec for place, spec in full.items() if spec.directory in teaching or _is_there(spec)}
+    return found | {place: spec for place, spec in paired.items() if spec.directory in teaching}
 
 
 def _is_there(spec: RunSpec) -> bool:

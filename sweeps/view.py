@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.cells import full_name, stops
+from acmr.cells import plain_name, stops
 from acmr.records import (
     COMPLETE,
     DIVERGED,
@@ -201,7 +201,7 @@ def steps_ahead(views: Sequence[RunStatus]) -> float:
 
 
 def _kind(directory: Path) -> tuple[str, str]:
-    return directory.parts[-3], full_name(directory.parts[-2])
+    return directory.parts[-3], plain_name(directory.parts[-2])
 
 
 def _told(status: dict[str, Any], state: State, alive: bool) -> tuple[str, str]:

@@ -17,7 +17,6 @@ from acmr.config import (
     TEACHER_CHOICE,
     ConfigError,
     SACConfig,
-    differing_keys,
     flatten,
     plain_settings,
     schema_defaults,
@@ -25,6 +24,7 @@ from acmr.config import (
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.errors import USER_ERRORS, check_booleans, explain
 from acmr.settings.run_spec import specify, teacher_spec
+from acmr.storage.run_dir import differing_keys
 
 LEAVES = [
     f"{path.parent.name}={path.stem}"
@@ -94,7 +94,7 @@ def test_python_defaults_say_what_the_files_of_the_paper_say():
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [
-        (["sed=1"], "sed: no such setting; did you mean seed?"),
+        (["sed=1"], "sed: no such setting; did you mean seed or seeding?"),
         (["q_lr=1e-4"], "did you mean agent.q_lr?"),
         (["trasfer=hidden"], "did you mean transfer"),
         (["+foo=1"], "foo: no such setting"),
@@ -137,6 +137,8 @@ def test_python_defaults_say_what_the_files_of_the_paper_say():
         (["tracking=self_hosted"], "tracking.base_url=http://HOST:PORT"),
         (["env=gym"], "env.id has no value: type env.id=VALUE"),
         (["seed=="], "not of the form key=value"),
+        (["seeding=pared"], "seeding=pared: must be one of independent, paired; did you mean seeding=paired?"),
+        (["seeding="], "seeding=: must be one of independent, paired"),
         (["stop=never"], "stop=never: must be one of horizon, threshold"),
         (["stop=treshold"], "must be one of horizon, threshold"),
         (["stop=threshold", "stop_after=0"], "stop_after=0: an integer of at least 1"),

@@ -33,7 +33,7 @@ from acmr.config import ExperimentConfig
 from acmr.records import EpisodeRecord
 from acmr.settings.run_spec import RunSpec
 from acmr.tracking.progress import make_progress
-progress = make_progress(RunSpec(ExperimentConfig(total_timesteps=3000, threshold=900), {}, "ant", "A2"))
+progress = make_progress(RunSpec(ExperimentConfig(total_timesteps=3000, threshold=900), {}, "ant", "A2", "ant"))
 for step in range(1, 3001):
     progress.on_step(step)
     if step % 500 == 0:
@@ -49,7 +49,7 @@ logging.info("logged after")
 
 def spec(total: int = 1000, threshold: float = 900.0, consecutive: int = 5, **more: Any) -> RunSpec:
     config = ExperimentConfig(total_timesteps=total, threshold=threshold, consecutive=consecutive, **more)
-    return RunSpec(config, {}, "armless_humanoid-hidden-frozen", "A2")
+    return RunSpec(config, {}, "armless_humanoid-hidden-frozen", "A2", "armless_humanoid-hidden-frozen")
 
 
 class Clock:

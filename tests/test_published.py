@@ -14,8 +14,9 @@ import pytest
 import yaml
 from safetensors.numpy import load_file
 
-from acmr.config import HORIZON, STOP_KEYS, differing_keys
+from acmr.config import HORIZON, STOP_KEYS
 from acmr.settings.compose import compose_config, parse
+from acmr.storage.run_dir import differing_keys
 from analysis.analyze import analyze
 from analysis.loading.load import load
 from docs import results

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from acmr.cells import full_name, stops
+from acmr.cells import plain_name, stops
 from acmr.config import ExperimentConfig
 from acmr.records import RUNNING
 from acmr.settings.compose import compose_config, parse
@@ -125,7 +125,7 @@ def test_a_full_run_that_was_asked_for_too_is_there_once(tmp_path):
 def test_the_name_of_a_run_that_stops_holds_that_of_the_full_one(overrides, full):
     stopped, whole = (specify(parse(compose_config(words))).name for words in (overrides, full))
     assert (stops(stopped), stops(whole)) == (True, False)
-    assert full_name(stopped) == full_name(whole) == whole
+    assert plain_name(stopped) == plain_name(whole) == whole
 
 
 def test_lengths_are_those_of_the_same_cell_else_of_the_profile():

@@ -13,9 +13,10 @@ from guides import ROOT, copy_checkout, follow
 
 from acmr.agent.architecture import CLAMP, TANH, Architecture, Dimensions
 from acmr.agent.networks import Networks
-from acmr.config import ConfigError, TransferConfig, TransferRules, differing_keys
+from acmr.config import ConfigError, TransferConfig, TransferRules
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.run_spec import specify
+from acmr.storage.run_dir import differing_keys
 from acmr.transfer import methods
 from acmr.transfer.methods import METHODS, Student, Taken, method, transfer
 from acmr.transfer.teacher import load_teacher, save_teacher

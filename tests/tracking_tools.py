@@ -50,7 +50,7 @@ def spec(
         agent=SACConfig(hidden_sizes=[64, 64], q_lr=0.001),
         tracking=TrackingConfig(**tracking),
     )
-    return RunSpec(config, {}, name, cell)
+    return RunSpec(config, {}, name, cell, name)
 
 
 def start(output_dir: Path, warnings: list[str], **tracking: Any) -> Observer:

@@ -12,7 +12,7 @@ from acmr.agent.learner import Learner, find_learner
 from acmr.agent.memory import check_memory
 from acmr.agent.networks import Networks
 from acmr.agent.precision import MatmulPrecision, choose_products
-from acmr.config import ConfigError
+from acmr.config import INDEPENDENT, ConfigError
 from acmr.envs import EnvDescription, check_resume, describe
 from acmr.envs.state import ResumeCheck
 from acmr.run.random_streams import RandomStreams, random_streams
@@ -70,7 +70,8 @@ def prepare(spec: RunSpec) -> Prepared:
     about = describe(config.env)
     dims = Dimensions(len(about.observation_names), len(about.action_names))
     teacher = find_teacher(config, dims)
-    streams = random_streams(config.seed, config.device)
+    apart = spec.kin if config.seeding == INDEPENDENT else None
+    streams = random_streams(config.seed, config.device, apart)
     architecture = Architecture(dims, tuple(config.agent.hidden_sizes), about.action_low, about.action_high)
     check_memory(config, architecture)
     fresh = Networks(architecture, streams.networks)

@@ -6,6 +6,7 @@ No global generator is touched.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,17 +52,18 @@ class RandomStreams:
             getattr(self, name).bit_generator.state = state[name]
 
 
-def random_streams(seed: int, device: str = "cpu") -> RandomStreams:
+def random_streams(seed: int, device: str = "cpu", apart: str | None = None) -> RandomStreams:
     """Derives every stream of a run from its seed.
 
     Args:
         seed: Any integer >= 0.
         device: Device on which the learner draws its noise.
+        apart: What sets the run's streams apart from those of other runs with the same seed; None: they share them.
 
     Returns:
         Streams that are independent of each other, by NumPy's ``SeedSequence.spawn``.
     """
-    networks, acting, learning, replay, exploration, environment = np.random.SeedSequence(seed).spawn(6)
+    networks, acting, learning, replay, exploration, environment = _root(seed, apart).spawn(6)
     return RandomStreams(
         networks=_torch_generator(networks, "cpu"),
         acting=_torch_generator(acting, "cpu"),
@@ -70,6 +72,14 @@ def random_streams(seed: int, device: str = "cpu") -> RandomStreams:
         exploration=np.random.default_rng(exploration),
         environment=int(environment.generate_state(1)[0]),
     )
+
+
+def _root(seed: int, apart: str | None) -> np.random.SeedSequence:
+    if apart is None:
+        return np.random.SeedSequence(seed)
+    # The seed's own length goes first, so that no seed followed by a name reads like another seed.
+    words = np.frombuffer(hashlib.sha256(apart.encode()).digest(), dtype="<u4").tolist()
+    return np.random.SeedSequence([seed.bit_length(), seed, *words])
 
 
 def _torch_generator(sequence: np.random.SeedSequence, device: str) -> torch.Generator:

@@ -48,6 +48,7 @@ def summarize(
         "transfer": config.transfer.name,
         "freeze": config.freeze,
         "seed": config.seed,
+        "seeding": config.seeding,
         "global_step": steps,
         "total_timesteps": config.total_timesteps,
         "stop": config.stop,

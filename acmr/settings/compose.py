@@ -145,7 +145,7 @@ def unknown_key(key: str) -> str:
     keys = [*setting_keys(), *(f"transfer.rules.{rule.name}" for rule in fields(TransferRules))]
     leaf = key.split(".")[-1]
     near = [known for known in keys if known.split(".")[-1] == leaf]
-    near = near or get_close_matches(key, [*keys, *groups()], n=3, cutoff=0.6)
+    near = near or get_close_matches(key, dict.fromkeys([*keys, *groups()]), n=3, cutoff=0.6)
     near = near or [known for known in keys if get_close_matches(leaf, [known.split(".")[-1]], cutoff=0.75)][:3]
     section = key.rpartition(".")[0]
     beside = [known for known in keys if section and known.rpartition(".")[0] == section]

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.cells import SOURCE, TARGET, cell_of, digest, run_name
+from acmr.cells import SOURCE, TARGET, cell_of, digest, run_name, without_kind
 from acmr.command import typed
 from acmr.config import (
     HORIZON,
@@ -41,12 +41,14 @@ class RunSpec:
         changes: Those that change the result and differ from the profile's own.
         name: Directory name, ``<env>-<transfer>[-frozen][-<key>=<value>...]``.
         cell: The cell (:mod:`acmr.cells`) that the run belongs to, or is the beginning of, if there is one.
+        kin: The name of all runs like this one, wherever they stop and however they use their seeds.
     """
 
     config: ExperimentConfig
     changes: dict[str, Any]
     name: str
     cell: str | None
+    kin: str
 
     @property
     def directory(self) -> Path:
@@ -79,7 +81,8 @@ def specify(config: ExperimentConfig) -> RunSpec:
         shown["transfer.teacher"] = _teacher_mark(config.transfer.teacher)
     kind = (config.transfer.name, config.freeze, shown)
     role = {config.pair.source: SOURCE, config.pair.target: TARGET}.get(config.env.name)
-    return RunSpec(config, changes, run_name(config.env.name, *kind), cell_of(role, *kind))
+    kin = run_name(config.env.name, config.transfer.name, config.freeze, without_kind(shown))
+    return RunSpec(config, changes, run_name(config.env.name, *kind), cell_of(role, *kind), kin)
 
 
 def teacher_spec(config: ExperimentConfig) -> RunSpec:

@@ -17,6 +17,7 @@ from acmr.config import (
     PRECISIONS,
     PROGRESS_MODES,
     RANDOM,
+    SEEDINGS,
     THRESHOLD,
     ConfigError,
     EnvConfig,
@@ -47,6 +48,7 @@ def validate(config: ExperimentConfig) -> None:
     """
     agent = config.agent
     _at_least("seed", config.seed, 0)
+    _one_of("seeding", config.seeding, SEEDINGS)
     for key in ("total_timesteps", "consecutive", "log_every"):
         _at_least(key, getattr(config, key), 1)
     _at_least("threads", config.threads, 1, MOST_THREADS)

@@ -12,7 +12,15 @@ from typing import Any
 
 import yaml
 
-from acmr.config import ConfigError, ExperimentConfig, differing_keys
+from acmr.config import (
+    TEACHER_CHOICE,
+    ConfigError,
+    ExperimentConfig,
+    flatten,
+    is_neutral,
+    plain_settings,
+    schema_defaults,
+)
 from acmr.foreign import SETTINGS, is_there, read_mapping
 from acmr.names import terminal
 from acmr.records import (
@@ -246,3 +254,19 @@ def holds_run(run_dir: RunDir, config: ExperimentConfig) -> bool:
             "type output_dir=FOLDER for another place, or force=true to replace it"
         )
     return True
+
+
+def differing_keys(stored: Mapping[str, Any], config: ExperimentConfig) -> list[str]:
+    """Settings, of those that change the result, in which a stored run differs from this one.
+
+    A setting that the stored run knew nothing of has the schema's default: one that is added to the schema must default
+    to what was done before, and then orphans no run. One that only the stored run knows did something that cannot be
+    done any more, so it counts as a difference, unless it was null: not set.
+    """
+    before, now = schema_defaults() | flatten(stored), flatten(plain_settings(config))
+    return [
+        key
+        for key in sorted(set(before) | set(now))
+        # One teacher may be reached in several ways; the run's name identifies it by its content.
+        if not is_neutral(key) and key not in TEACHER_CHOICE and before.get(key) != now.get(key)
+    ]

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from acmr.cells import plain_name
 from acmr.command import command, typed
 from acmr.config import ConfigError
 from acmr.foreign import is_there, read_mapping
@@ -57,7 +58,8 @@ def rebuild(run_dir: Path, tracking: str, say: Say, folder: str | None = None) -
     own = replace(config.tracking, tracker=chosen.tracker, options=chosen.options, base_url=None, dir=folder)
     # What is removed and written lies where the run does, whatever its files say.
     config = replace(config, tracking=own, **_place(run_dir, config.seed))
-    tracker = make_tracker(RunSpec(config, {}, run_dir.parent.name, _cell(summary)), say)
+    name = run_dir.parent.name
+    tracker = make_tracker(RunSpec(config, {}, name, _cell(summary), plain_name(name)), say)
     replay(tracker, events)
     tracker.close(summary)
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from acmr.config import THRESHOLD, TransferConfig
+from acmr.config import INDEPENDENT, THRESHOLD, ExperimentConfig, TransferConfig
 from acmr.records import EpisodeRecord, portable_settings
 from acmr.settings.run_spec import RunSpec
 from acmr.text import one_line
@@ -152,13 +152,13 @@ def _mirror(spec: RunSpec, server: str | None) -> Run:
 def short_name(spec: RunSpec) -> str:
     """What tells a run apart in a few characters: ``A2-s3-paper``, or where it is no cell ``s3-ant-hidden-paper``."""
     profile, seed = spec.config.profile, spec.config.seed
-    ending = f"-{STOPPED}" if spec.config.stop == THRESHOLD else ""
+    ending = "".join(f"-{kind}" for kind in _kinds(spec.config))
     return f"{spec.cell}-s{seed}-{profile}{ending}" if spec.cell else f"s{seed}-{spec.name}-{profile}"
 
 
 def labels(spec: RunSpec) -> dict[str, Any]:
     """Words to find a run by: ``group`` (what its seeds share), ``job_type`` (teacher or student) and ``tags``."""
-    config, stops = spec.config, spec.config.stop == THRESHOLD
+    config, kinds = spec.config, _kinds(spec.config)
     # The schema's default: nothing is transferred. Stored settings do not hold the rules of the method.
     teaches = config.transfer.name == TransferConfig().name and config.env.name == config.env.source
     tags = [
@@ -169,8 +169,14 @@ def labels(spec: RunSpec) -> dict[str, Any]:
         f"seed{config.seed}",
     ]
     return {
-        # Runs of different lengths are not averaged with each other.
-        "group": f"{config.profile}/{spec.cell if spec.cell and not stops else spec.name}",
+        # Runs of different lengths, or of one seed, are not averaged with each other.
+        "group": f"{config.profile}/{spec.cell if spec.cell and not kinds else spec.name}",
         "job_type": "teacher" if teaches else "student",
-        "tags": [*tags, *([spec.cell] if spec.cell else []), *([STOPPED] if stops else [])],
+        "tags": [*tags, *([spec.cell] if spec.cell else []), *kinds],
     }
+
+
+def _kinds(config: ExperimentConfig) -> list[str]:
+    """What tells a run from others of its cell and seed, in a word each."""
+    found = {STOPPED: config.stop == THRESHOLD, INDEPENDENT: config.seeding == INDEPENDENT}
+    return [kind for kind, holds in found.items() if holds]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from acmr.cells import CELLS, SOURCE, Cell, full_name, run_name
+from acmr.cells import CELLS, SOURCE, Cell, plain_name, run_name
 from acmr.config import flatten
 from acmr.foreign import real_path
 from acmr.records import SEED_FOLDER
@@ -59,7 +59,7 @@ def identify(directory: Path, name: str, config: Mapping[str, Any], summary: Map
     elif config:
         cell = _cell_of(settings, name)
     else:
-        cell = dict(_names()).get(full_name(name).lower())
+        cell = dict(_names()).get(plain_name(name).lower())
     # A link may have any name; what it leads to tells the seed.
     match = SEED_FOLDER.fullmatch(directory.name) or SEED_FOLDER.fullmatch(real_path(directory).name)
     said = (summary.get("seed"), settings.get("seed"), int(match[1]) if match else None)
@@ -81,7 +81,7 @@ def _cell_of(settings: Mapping[str, Any], name: str) -> str | None:
     Settings that differ from the profile's are part of the name, and the profile itself is not at hand.
     """
     env, transfer, freeze = settings.get("env.name"), settings.get("transfer.name"), bool(settings.get("freeze"))
-    own = full_name(Path(name).name)
+    own = plain_name(Path(name).name)
     # Of two cells that a directory by a mere cell's name could hold, the one that asks for more.
     for cell in sorted(CELLS.values(), key=lambda cell: -len(cell.changes)):
         meant = (settings.get(f"pair.{cell.role}"), cell.transfer, cell.freeze)

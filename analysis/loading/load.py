@@ -41,9 +41,10 @@ class RunSet:
             is not known of a run that counts, as a file was changed or is missing), ``counted`` (enters
             comparisons), ``episodes`` (number), ``last_step`` (end of the last episode), ``horizon`` (step
             up to which the run is known not to have reached the threshold, if it has not), ``cut`` (ends at
-            its own threshold, as ``stop=threshold`` has it, before its last step), ``stop_after`` (step at
-            which such a run ends at the latest), ``total_timesteps``, ``learning_starts``, ``acts_from``
-            (step from which the agent chooses its actions), ``threshold``, ``consecutive``,
+            its own threshold, as ``stop=threshold`` has it, before its last step), ``apart`` (shares no
+            random numbers with other runs of its seed, as ``seeding=independent`` has it), ``stop_after``
+            (step at which a run that is cut ends at the latest), ``total_timesteps``, ``learning_starts``,
+            ``acts_from`` (step from which the agent chooses its actions), ``threshold``, ``consecutive``,
             ``wall_seconds``, ``steps_per_second``.
         episodes: One row an episode: ``run, group, seed`` and the columns of ``episodes.csv``; steps ascend within a
             run.
@@ -120,7 +121,7 @@ def _named(runs: list[FoundRun]) -> dict[str, FoundRun]:
 
 _RUN_COLUMNS = (
     *("run", "directory", "group", "cell", "seed", "profile", "env", "transfer", "freeze", "state", "reason", "doubts"),
-    *("episodes", "last_step", "horizon", "cut"),
+    *("episodes", "last_step", "horizon", "cut", "apart"),
     *("total_timesteps", "stop_after", "learning_starts", "acts_from", "threshold", "consecutive"),
     *("wall_seconds", "steps_per_second", "steps_in_summary"),
 )
@@ -129,7 +130,7 @@ _FLOATS = _RUN_COLUMNS[_RUN_COLUMNS.index("total_timesteps") :]
 
 def _runs_frame(rows: list[dict[str, Any]]) -> pd.DataFrame:
     frame = pd.DataFrame(rows, columns=list(_RUN_COLUMNS))
-    frame = frame.astype({**dict.fromkeys(_FLOATS, "float64"), "seed": "Int64", "cut": "bool"})
+    frame = frame.astype({**dict.fromkeys(_FLOATS, "float64"), "seed": "Int64", "cut": "bool", "apart": "bool"})
     frame = frame.astype(dict.fromkeys(("episodes", "last_step", "horizon"), "int64"))
     position = {cell: index for index, cell in enumerate(CELLS)}
     frame["order"] = [position.get(group, len(position)) for group in frame["group"]]
@@ -150,21 +151,27 @@ def _one_profile(root: Path, runs: pd.DataFrame) -> None:
 def _mark_duplicates(runs: pd.DataFrame) -> None:
     """Of several directories that claim one group and seed, only one may count.
 
-    A finished one does, of those the full one, of cut ones the one that was watched longest, else the first.
+    A finished one does, of those one that other runs of its seed can be paired with, of those the full one, of cut ones
+    the one that was watched longest, else the first.
     """
     for _, same in runs[runs["state"] != DAMAGED].groupby(["group", "seed"]):
         if len(same) > 1:
             watched = same["horizon"].where(same["cut"], 0)
-            ranks = same.assign(full=~same["cut"], watched=watched, limit=same["stop_after"].fillna(np.inf))
-            by = ["counted", "full", "watched", "limit"]
+            limit = same["stop_after"].fillna(np.inf)
+            ranks = same.assign(shared=~same["apart"], full=~same["cut"], watched=watched, limit=limit)
+            by = ["counted", "shared", "full", "watched", "limit"]
             kept = ranks.sort_values(by, ascending=False, kind="stable").index[0]
             others = same[same.index != kept]
+            alike = others["apart"] == runs.loc[kept, "apart"]
             # Both are the same run as far as the cut one goes: nothing is lost by leaving that out.
-            superseded = others["counted"] & others["cut"]
+            superseded = others["counted"] & others["cut"] & alike
             what = "longer" if runs.loc[kept, "cut"] else "full"
-            reasons = [f"{kept} is the {what} run of the same" if cut else f"{kept} is the same" for cut in superseded]
+            reasons = np.where(superseded, f"{kept} is the {what} run of the same", f"{kept} is the same")
+            hints = np.where(alike, "", "; seeding=independent needs seeds, or an output_dir, of its own")
             runs.loc[others.index, "state"] = np.where(superseded, SUPERSEDED, DUPLICATE)
-            runs.loc[others.index, "reason"] = [f"{reason} group and seed" for reason in reasons]
+            runs.loc[others.index, "reason"] = [
+                f"{reason} group and seed{hint}" for reason, hint in zip(reasons, hints, strict=True)
+            ]
             runs.loc[others.index, "counted"] = False
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 
 from acmr.cells import CELLS
 from acmr.command import typed
-from acmr.config import THRESHOLD
+from acmr.config import INDEPENDENT, THRESHOLD
 from analysis.loading.load import RunSet
 from analysis.loading.read_run import DAMAGED
 
@@ -79,11 +79,12 @@ def missing_runs(data: RunSet) -> list[Missing]:
 
 
 def stop_words(runs: pd.DataFrame) -> str:
-    """What is typed so that a run ends as those of these that stop at their threshold; empty if none does."""
+    """What is typed so that a run ends, and draws from its seed, as these do; empty for the paper's way."""
+    seeding = f" seeding={INDEPENDENT}" if runs["apart"].any() else ""
     limits = runs.loc[runs["cut"], "stop_after"]
     if limits.empty:
-        return ""
-    return f" stop={THRESHOLD}" + ("" if pd.isna(limits.max()) else f" stop_after={limits.max():.0f}")
+        return seeding
+    return f" stop={THRESHOLD}{'' if pd.isna(limits.max()) else f' stop_after={limits.max():.0f}'}{seeding}"
 
 
 def command_for(runs: pd.DataFrame, seeds: Iterable[int], profile: str) -> str:

@@ -10,8 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from acmr.cells import stops
-from acmr.config import POLICY, THRESHOLD
+from acmr.cells import draws_apart, stops
+from acmr.config import INDEPENDENT, POLICY, THRESHOLD
 from acmr.foreign import is_there
 from acmr.records import (
     COMPLETE,
@@ -82,14 +82,17 @@ def read_run(root: Path, folder: RunFolder) -> FoundRun:
     name = directory.relative_to(root).as_posix()
     parent = Path(name).parent.as_posix() if directory != root else directory.resolve().parent.name
     config, summary = files.config, files.summary
-    identity = identify(directory, parent if parent != "." else root.resolve().name, config, summary)
+    parent = parent if parent != "." else root.resolve().name
+    identity = identify(directory, parent, config, summary)
     state, reasons = (DAMAGED, []) if damaged else _state(directory, identity, frame, files, notes)
     measures = _measures(state, frame, config, summary)
     doubts = [*files.doubts, *_unknown(state, measures)]
     reasons += [*doubts, *files.left_out]
     reasons += [f"also found as {other.relative_to(root).as_posix()}" for other in folder.others]
     row = {"run": name, **vars(identity), "state": state, "reason": "; ".join([*notes, *reasons])}
-    row |= measures | _stop(name, frame, config, summary) | {"doubts": "; ".join([*said, *doubts])}
+    row |= measures | _stop(parent, frame, config, summary) | {"doubts": "; ".join([*said, *doubts])}
+    seeding = summary.get("seeding", config.get("seeding"))
+    row["apart"] = draws_apart(parent) if seeding is None else seeding == INDEPENDENT
     if state == DIVERGED and not pd.isna(row["stop_after"]):
         row["horizon"] = int(row["stop_after"])  # it would not have been watched any longer
     elif state == UNFINISHED:

@@ -20,7 +20,7 @@ _OWN_ENTRIES = {"run", "profile"}
 #: What a run's settings and its summary both say, and so must agree on.
 _SAID_TWICE = {
     **{key: key for key in ("seed", "freeze", "profile", "total_timesteps", "threshold", "consecutive")},
-    **{key: key for key in ("stop", "stop_after")},
+    **{key: key for key in ("stop", "stop_after", "seeding")},
     "env": "env.name",
     "transfer": "transfer.name",
 }

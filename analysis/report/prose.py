@@ -70,7 +70,7 @@ def caveats(threshold: float, cells: Sequence[Cell]) -> list[str]:
         f"{families} Holm's adjustment stands beside them; it leaves out {others}, which are other questions. A cell "
         "that never reached the threshold stays in the family.",
         "Students of one seed share a teacher, and H1 continues H0; the tests take cells as independent, as the "
-        "paper does.",
+        "paper does. Unless they were made with seeding=independent, runs of one seed share its random numbers, too.",
     ]
 
 

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from analysis.statistics.comparisons import bias
+from analysis.statistics.study.pairs import shared_seeds
 from analysis.statistics.two_samples import ALPHA
 
 _NAN = float("nan")
@@ -114,7 +115,7 @@ def _compare(runs: pd.DataFrame, margin: float, reference: str, index: str) -> d
     first, second = (runs[(runs["group"] == group) & runs["counted"]].set_index("seed") for group in (reference, index))
     row: dict[str, Any] = {"reference": reference, "index": index, "margin": margin, "equivalent": "", "note": ""}
     row |= {"runs_reference": len(first), "runs_index": len(second)}
-    seeds = sorted(set(first.index) & set(second.index))
+    seeds = shared_seeds(first, second)
     row["pairs"] = len(seeds)
     if said := bias(first) or bias(second):
         return row | {"note": said}

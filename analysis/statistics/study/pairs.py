@@ -2,7 +2,8 @@
 
 Runs of one seed share the seed of the environment, the random first actions and the streams that fresh weights are
 drawn from, and students their teacher. Where that makes runs of one seed alike, differences within the seeds vary less
-than those between runs of any seeds; where it does not, degrees of freedom are given away for nothing.
+than those between runs of any seeds; where it does not, degrees of freedom are given away for nothing. A run with
+``seeding=independent`` shares none of that and is no part of a pair.
 """
 
 from __future__ import annotations
@@ -68,11 +69,12 @@ def paired_comparisons(runs: pd.DataFrame, episodes: pd.DataFrame, pairs: Iterab
 
 def _compare(runs: pd.DataFrame, episodes: pd.DataFrame, reference: str, index: str) -> dict[str, Any]:
     first, second = (_by_seed(runs, group) for group in (reference, index))
-    seeds = sorted(set(first.index) & set(second.index))
+    seeds = shared_seeds(first, second)
     row: dict[str, Any] = {"reference": reference, "index": index, "pairs": len(seeds), "note": ""}
     row["unpaired"] = len(first) + len(second) - 2 * len(seeds)
     if not seeds:
-        return row | {"note": "no seed of both"}
+        apart = set(first.index) & set(second.index)
+        return row | {"note": "runs of one seed are independent" if apart else "no seed of both"}
     a, b = first.loc[seeds], second.loc[seeds]
     names = zip(a["run"], b["run"], strict=True)
     row["shared_episodes"] = min(_shared(episodes, *pair) for pair in names)
@@ -89,6 +91,15 @@ def _compare(runs: pd.DataFrame, episodes: pd.DataFrame, reference: str, index: 
 def _by_seed(runs: pd.DataFrame, group: str) -> pd.DataFrame:
     own = runs[(runs["group"] == group) & runs["counted"]]
     return own.reset_index(names="run").set_index("seed")
+
+
+def shared_seeds(*groups: pd.DataFrame) -> list[int]:
+    """Seeds that all groups have, and whose random numbers all of those runs draw from.
+
+    Args:
+        groups: Runs, indexed by seed, with the column ``apart``.
+    """
+    return sorted(set.intersection(*(set(own.index[~own["apart"]]) for own in groups)))
 
 
 def _shared(episodes: pd.DataFrame, first: str, second: str) -> int:
@@ -179,14 +190,14 @@ def _blocks(runs: pd.DataFrame, family: str) -> dict[str, Any] | None:
     cells = [name for name, own in there.items() if len(own)]
     if len(cells) < 3:
         return None
-    seeds = sorted(set.intersection(*(set(there[name].index) for name in cells)))
+    seeds = shared_seeds(*(there[name] for name in cells))
     row: dict[str, Any] = {"family": family, "cells": ", ".join(cells), "seeds": len(seeds), "note": ""}
     if said := next(filter(None, (bias(there[name]) for name in cells)), ""):
         return row | {"note": said}
     used = pd.concat([there[name].loc[seeds] for name in cells])
     if len(seeds) < 2 or stopped_before(used).any():
         why = (
-            "fewer than two seeds have all cells" if len(seeds) < 2 else "some run stopped before it met the threshold"
+            "fewer than two seeds pair all cells" if len(seeds) < 2 else "some run stopped before it met the threshold"
         )
         return row | {"note": why}
     horizon = common_horizon(used)
