@@ -40,7 +40,8 @@ SUBCOMMANDS = {
     "evaluate": "acmr.evaluation",
     "envs": "acmr.envs",
     "mirror": "acmr.tracking.mirror",
-    "export": "acmr.app.exports",
+    "export": "acmr.exchange.exports",
+    "import": "acmr.exchange.imports",
 }
 #: Whether this is a checkout; looked up once, for later the place may be one that this process may not look into.
 _IN_CHECKOUT = os.path.isfile(Path(__file__).resolve().parents[1] / SUBCOMMANDS["train"])

@@ -5,6 +5,7 @@ import shlex
 import sys
 from dataclasses import replace
 from importlib.util import find_spec
+from itertools import takewhile
 
 import numpy as np
 import pytest
@@ -14,8 +15,8 @@ from guides import ROOT, blocks
 
 import acmr
 from acmr.agent.architecture import Dimensions
-from acmr.app.exports import main
-from acmr.app.sb3 import write_sb3
+from acmr.exchange.exports import main
+from acmr.exchange.sb3_writer import write_sb3
 from acmr.transfer.teacher import load_teacher
 
 DOCUMENT = ROOT / "docs" / "exchange.md"
@@ -130,7 +131,9 @@ def test_the_page_runs_as_it_is_written(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     acmr.train("env=ant", profile="quick", total_timesteps=1100, tracking="off", progress="off")
     there, whole = "runs/quick/ant-none-total_timesteps=1100", "runs/quick/ant-none"
-    (command, *snippets) = blocks(DOCUMENT)
+    (command, *others) = blocks(DOCUMENT)
+    snippets = list(takewhile(lambda block: block.language == "python", others))
+    assert len(snippets) == 3
     words = shlex.split(command.text.replace(whole, there))
     assert words[:2] == ["acmr", "export"]
     assert main(words[2:]) == 0

@@ -63,7 +63,7 @@ class TeacherDescription:
         hidden_sizes: Widths of the hidden layers.
         core: Observation and action dimension of its inner layers where adapters surround them, else None.
         adapter_activation: Activation behind the input adapter.
-        log_alpha: Log of the final temperature; None where it is not known, or is one of other actions.
+        log_alpha: Log of the final temperature; None where it is not known.
         seed: Seed of the run.
         profile: Profile of the run.
         global_step: Environment steps it was trained for.

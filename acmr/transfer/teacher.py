@@ -44,12 +44,12 @@ class Teacher:
         """Log of its temperature, for a student that begins with it (``transfer.copy_log_alpha``).
 
         Raises:
-            ConfigError: If it has none that means the same here.
+            ConfigError: If it was imported, and its temperature is not known.
         """
         if self.description.log_alpha is None:
             raise ConfigError(
-                f"transfer.copy_log_alpha=true: {self.path} was imported without a temperature that means the same "
-                "here (docs/exchange.md); type transfer.copy_log_alpha=false"
+                f"transfer.copy_log_alpha=true: {self.path} was imported without its temperature; type "
+                "transfer.copy_log_alpha=false, or import it again with --alpha (docs/exchange.md)"
             )
         return self.description.log_alpha
 

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 
 from acmr.agent.networks import Actor
-from acmr.app.sb3 import write_sb3
 from acmr.command import command, typed
 from acmr.config import ConfigError
 from acmr.evaluation.evaluate import load_policy
+from acmr.exchange.sb3_writer import write_sb3
 from acmr.names import terminal
 from acmr.transfer.teacher import Teacher
 
