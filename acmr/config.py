@@ -14,7 +14,7 @@ from typing import Any
 #: Settings that cannot change what a run computes: they are no part of a run's name.
 NEUTRAL_KEYS = (
     "device", "threads", "output_dir", "force", "progress", "log_every", "tracking", "profile", "pair",
-    "checkpoint_every", "resume",
+    "checkpoint_every", "resume", "metric",
 )  # fmt: skip
 
 #: Settings that a teacher must share with its student: its length and the shape of its networks.
@@ -30,6 +30,10 @@ STOP_KEYS = ("stop", "stop_after")
 #: How runs of one seed are related: they share its random numbers, or each cell draws from numbers of its own.
 PAIRED, INDEPENDENT = "paired", "independent"
 SEEDINGS = (PAIRED, INDEPENDENT)
+
+#: What a run is worth to a search: nothing is told, steps to its threshold, or a return that needs the whole run.
+NONE, STEPS, END_METRICS = "none", "steps_to_threshold", ("final_return", "area", "evaluation")
+METRICS = (NONE, STEPS, *END_METRICS)
 
 PROGRESS_MODES = ("auto", "bar", "lines", "off")
 #: How matrix products are computed.
@@ -247,6 +251,8 @@ class ExperimentConfig:
     log_every: int = 1_000
     #: Environment steps between two checkpoints; None: as the length of the run suggests; 0: none are made.
     checkpoint_every: int | None = None
+    #: What a sweeper of Hydra's is told of the run, one of :data:`METRICS` (:mod:`acmr.app.metric`).
+    metric: str = NONE
     #: ``inexact`` goes on from a checkpoint of another machine or of other versions, and records that.
     resume: str = EXACT
     #: Name of the file in ``conf/profile`` whose values hold where nothing else is said.

@@ -39,34 +39,44 @@ def main() -> int:
 def _train_as_typed() -> None:
     import hydra
 
+    from acmr.app.other_sweepers import with_their_words
     from acmr.settings.command_line import hydra_arguments
     from acmr.settings.compose import CONFIG_FOLDER, register_schema
 
-    sys.argv[1:] = hydra_arguments(sys.argv[1:])
-    register_schema()
-    # The folder's own path: Hydra would look beside this file, which may have been called through a link.
-    hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="config")(_train)()
+    with with_their_words(hydra_arguments(sys.argv[1:])) as arguments:
+        sys.argv[1:] = arguments
+        register_schema()
+        # The folder's own path: Hydra would look beside this file, which may have been called through a link.
+        hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="config")(_train)()
 
 
-def _train(cfg: DictConfig) -> None:
-    """Runs what the command line describes; sweeps.sweeper does so where that is more than one run."""
+def _train(cfg: DictConfig) -> float | None:
+    """Runs what the command line describes; sweeps.sweeper does so where that is more than one run.
+
+    Returns:
+        What the run is worth, to Hydra and its other sweepers; None where no ``metric`` is asked for.
+    """
     from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
 
     from acmr.settings.compose import CONFIG_FOLDER, look_in, parse
     from acmr.settings.errors import check_booleans
     from acmr.settings.run_spec import specify
     from acmr.settings.sources import sources_of
 
+    found: list[float | None] = []
+
     def start() -> None:
         # Hydra types it as what it holds; it is a DictConfig.
         hydra: Any = HydraConfig.get()
         look_in(sources_of(hydra, CONFIG_FOLDER))
         check_booleans(hydra.overrides.task)
-        _run(specify(parse(cfg)))
+        found.append(_run(specify(parse(cfg)), searched=hydra.mode == RunMode.MULTIRUN))
 
     # An error that left from here would get a line of Hydra's own before it.
     if code := _exit_code(start):
         sys.exit(code)
+    return found[0]
 
 
 def _train_job(path: Path) -> None:
@@ -85,12 +95,22 @@ def _train_job(path: Path) -> None:
         raise
 
 
-def _run(spec: RunSpec, begun: Callable[[], None] = lambda: None) -> None:
+def _run(spec: RunSpec, begun: Callable[[], None] = lambda: None, searched: bool = False) -> float | None:
     # Here, so that a wrong setting is refused without waiting for torch and MuJoCo to load.
+    from acmr.config import NONE
     from acmr.run.experiment import exit_code, run_experiment
 
-    if code := exit_code(run_experiment(spec, begun=begun)):
+    summary, config = run_experiment(spec, begun=begun), spec.config
+    value = None
+    if config.metric != NONE:
+        from acmr.app.metric import metric_line, metric_of
+
+        value = metric_of(spec, summary, config.metric)
+        print(metric_line(config, summary, value))
+    # To a search that a run diverged is something to learn from; else it would end it.
+    if (code := exit_code(summary)) and not (searched and value is not None):
         sys.exit(code)
+    return value
 
 
 def _exit_code(run: Callable[[], None]) -> int:

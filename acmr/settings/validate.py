@@ -9,15 +9,18 @@ from dataclasses import asdict
 from acmr.command import typed
 from acmr.config import (
     ACTIVATIONS,
+    END_METRICS,
     EXACT,
     HORIZON,
     IMPUTATIONS,
     INEXACT,
+    METRICS,
     POLICY,
     PRECISIONS,
     PROGRESS_MODES,
     RANDOM,
     SEEDINGS,
+    STEPS,
     THRESHOLD,
     ConfigError,
     EnvConfig,
@@ -80,6 +83,7 @@ def validate(config: ExperimentConfig) -> None:
     _one_of("agent.start", agent.start, (RANDOM, POLICY))
     _one_of("progress", config.progress, PROGRESS_MODES)
     _one_of("resume", config.resume, (EXACT, INEXACT))
+    _one_of("metric", config.metric, METRICS)
     _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
     _check_impute(config.transfer.impute)
     check_address("tracking.base_url", config.tracking.base_url)
@@ -128,6 +132,12 @@ def _check_impute(rule: str) -> None:
 
 def _check_stop(config: ExperimentConfig) -> None:
     _one_of("stop", config.stop, (HORIZON, THRESHOLD))
+    if config.stop == THRESHOLD and config.metric in END_METRICS:
+        # Of runs of different lengths these are no measure of one thing.
+        raise ConfigError(
+            f"metric={config.metric} stop={config.stop}: is taken of runs that make all their steps; "
+            f"type stop=horizon, or metric={STEPS}"
+        )
     after = config.stop_after
     if after is None:
         return
