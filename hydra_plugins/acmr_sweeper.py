@@ -46,18 +46,14 @@ class StagedSweeper(BasicSweeper):
             ConfigError: If the sweep cannot be made; nothing has been started then.
         """
         # Here, because Hydra imports this file at the start of every single run.
-        from acmr.config import ConfigError
-        from sweeps.sweeper import Settings, check_swept, run_sweep
+        from acmr.settings.swept import check_counts, check_swept
+        from sweeps.sweeper import Settings, run_sweep
 
         assert self.hydra_context is not None
         assert self.config is not None
         check_swept(self.params, self.config)
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
         overrides = parser.parse_overrides([*self._parse_config(), *arguments])
-        for override in overrides:
-            if override.is_sweep_override() and not override.is_discrete_sweep():
-                raise ConfigError(
-                    f"{override.input_line}: has no end; sweep a list, as in {override.key_or_group}=1,2, or range(1,3)"
-                )
+        check_counts(overrides)
         jobs = self.split_arguments(overrides, None)[0]
         raise SystemExit(run_sweep(jobs, Settings(**self.settings), self.config, self.hydra_context))

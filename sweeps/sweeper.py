@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +17,7 @@ from omegaconf import DictConfig
 
 from acmr.config import ConfigError
 from acmr.records import COMPLETE, FAILED, NO_EPISODE, RUNNING, STOPPED
-from acmr.settings.compose import CONFIG_FOLDER, groups, look_in, setting_keys, sources, unknown_key
-from acmr.settings.errors import FREE_KEYS
-from acmr.settings.files import place_of_text
+from acmr.settings.compose import CONFIG_FOLDER, look_in, sources
 from acmr.settings.sources import sources_of
 from acmr.storage.durable import WriteError
 from acmr.text import one_line
@@ -243,23 +241,6 @@ def entries_of(plan: Plan, output_dir: Path) -> list[SweepRun]:
         )
         for run in plan.runs
     ]
-
-
-def check_swept(params: Mapping[str, object], config: DictConfig) -> None:
-    """Refuses a matrix that sweeps a setting which is not there.
-
-    Args:
-        params: What its file sweeps.
-        config: Hydra's composed config.
-
-    Raises:
-        ConfigError: With the file and the place in it.
-    """
-    for key in params:
-        if key in groups() or key in setting_keys() or key.startswith(("+", "hydra.", *FREE_KEYS)):
-            continue
-        place, file = sources().file(f"matrix/{config.hydra.runtime.choices.get('matrix')}")
-        raise ConfigError(f"{place}: hydra.sweeper.params: {unknown_key(key)}{place_of_text(file, key)}")
 
 
 def _check(settings: Settings) -> None:

@@ -56,9 +56,9 @@ def test_a_file_builds_on_another(conf: Path) -> None:
     [
         ("id: Ant-v5\nremove_body: [a]\n",
          "conf/env/bad.yaml: env.remove_body: no such setting; did you mean env.remove_bodies?"),
-        ("remove_bodies: 3\n", "conf/env/bad.yaml: env.remove_bodies: Invalid value"),
+        ("remove_bodies: 3\n", "conf/env/bad.yaml: env.remove_bodies: must be a list, as in [a, b]"),
         ("id: [Ant-v5]\n", "conf/env/bad.yaml: env.id: Cannot convert"),
-        ("- a\n- b\n", "conf/env/bad.yaml: Merge error: list is not a subclass of EnvConfig"),
+        ("- a\n- b\n", "conf/env/bad.yaml: env: holds settings: write each on a line"),
         ("id: [", "not readable as YAML: while parsing"),
         ("id: \0", "not readable as YAML: unacceptable character"),
         ("defaults: [humanoyd]\n", "conf/env/bad.yaml: env=humanoyd: must be one of "),

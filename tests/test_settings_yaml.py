@@ -60,7 +60,7 @@ FAULTS: dict[str, tuple[str, str | bytes, str]] = {
     "missing default": ("env", "defaults: [humanoyd]\n", "did you mean env=humanoid? (line 1, column 12)"),
     "missing group": ("env", "defaults:\n  - /transfr: hidden\n",
                       "transfr=hidden: there is no group transfr, only agent, env, experiment, matrix, profile, "
-                      "tracking, transfer; did you mean transfer? (line 2, column 15)"),
+                      "seeding, tracking, transfer; did you mean transfer? (line 2, column 15)"),
     "missing group, as a path": ("env", "defaults: [/transfr/hidden]\n", "there is no group transfr, only agent, env"),
     "missing override": ("experiment", "# @package _global_\ndefaults:\n  - override /evn: ant\n",
                          "override evn: there is no group evn, only agent, env,"),
@@ -77,6 +77,18 @@ FAULTS: dict[str, tuple[str, str | bytes, str]] = {
     "an object": ("env", "name: !!python/object/apply:os.system [ls]\n",
                   "Python objects are not allowed; write plain text"),
     "a circle": ("env", "name: &a [*a]\n", "not readable as YAML: a part of it holds itself"),
+    "a list in the place of settings": ("env", "- a\n", "env: holds settings: write each on a line of its own"),
+    "a value in the place of settings": ("experiment", "# @package _global_\nagent: sac\n",
+                                         "agent: holds settings: write each on a line of its own below it, as key: "
+                                         "value (line 2, column 8)"),
+    "a list of arguments": ("env", f"{ANT}kwargs: [a]\n", "env.kwargs: holds settings: write each on a line of its"),
+    "settings in the place of a list": ("env", f"{ANT}drop_sensors: {{a: 1}}\n",
+                                        "env.drop_sensors: must be a list, as in [a, b] (line 4, column 15)"),
+    "a value in the place of a list": ("agent", "defaults: [sac]\nhidden_sizes: 256\n",
+                                       "agent.hidden_sizes: must be a list, as in [a, b] (line 2, column 15)"),
+    "rules that are none": ("transfer", "name: hidden\nrules: true\n", "transfer.rules: holds settings: write each"),
+    "a number without end": ("env", f"{ANT}max_episode_steps: {'9' * 5000}\n", "not readable as YAML: Exceeds the"),
+    "half a header": ("env", f"# @package\n{ANT}", "not readable as YAML: Expected header format"),
     "an interpolation": ("env", f"{ANT}kwargs: {{a: '${{nowhere}}'}}\n",
                          "Interpolation key 'nowhere' not found (line 4"),
     "a broken interpolation": ("env", "id: ${nowhere\n", "id: no viable alternative at input '${nowhere' (line 1"),
@@ -96,6 +108,28 @@ def test_a_fault_is_one_line(
     assert says in line
 
 
+CIRCLES = {
+    "of two": {"bad": "worse", "worse": "bad"},
+    "of three, and a way into it": {"bad": "b1", "b1": "b2", "b2": "b3", "b3": "b1"},
+    "through a file of the project": {"bad": "humanoid", "humanoid": "paper_source"},
+}
+
+
+@pytest.mark.parametrize("builds_on", CIRCLES.values(), ids=CIRCLES)
+def test_files_that_build_on_each_other_are_named(builds_on: dict[str, str], folders: tuple[Path, Path]) -> None:
+    main, own = folders[0] / "env", folders[1] / "env"
+    own.mkdir()
+    for name, other in builds_on.items():
+        (own / f"{name}.yaml").write_text(f"defaults: [{other}]\nname: {name}\n")
+    # It would hide the user's own, which closes the circle.
+    (main / "humanoid.yaml").unlink()
+    start = builds_on["bad"] if "humanoid" in builds_on or "b1" in builds_on else "bad"
+    line = refusal("env=bad")
+    assert line.startswith(f"{own / start}.yaml: defaults: builds on ")
+    assert line.count("builds on") == (3 if start == "b1" else 2)
+    assert line.endswith(f", which builds on {own / start}.yaml; name another file in one")
+
+
 @pytest.mark.parametrize("text", [f"\ufeff{ANT}", ANT.replace("\n", "\r\n"), ANT[:-1], f"# für\n{ANT}"])
 def test_what_is_no_fault(text: str, folders: tuple[Path, Path]) -> None:
     (folders[0] / "env" / "bad.yaml").write_bytes(text.encode())
@@ -110,7 +144,8 @@ def test_what_is_no_fault(text: str, folders: tuple[Path, Path]) -> None:
         ("env/bad.yaml", b"", ["-m", "env=ant,bad"], "bad.yaml: is empty; write its settings"),
         ("matrix/bad.yaml", b"# @package _global_\nhydra:\n\tmode: MULTIRUN\n", ["matrix=bad"], "a tab; indent with"),
         ("matrix/bad.yaml", MATRIX, ["matrix=bad"],
-         "bad.yaml: hydra.sweeper.params: sed: no such setting; did you mean seed? (line 2, column 44)"),
+         "bad.yaml: hydra.sweeper.params: sed: no such setting; did you mean seed or seeding? (line 2, column 44)"),
+        ("env/bad.yaml", b"defaults: [/env/bad@_here_]\n", ["env=bad"], "bad.yaml: defaults: builds on "),
         ("env/good.yaml", ANT.encode(), ["env=null"], "env=null: must be one of ant, "),
         ("env/good.yaml", ANT.encode(), ["transfer=3"], "transfer=3: must be one of direct, expand, hidden, named"),
     ],

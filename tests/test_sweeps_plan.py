@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
@@ -18,6 +19,7 @@ from acmr.config import ConfigError
 from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse, register_schema
 from acmr.settings.errors import USER_ERRORS, explain
 from acmr.settings.run_spec import RunSpec, specify
+from acmr.settings.swept import MOST_RUNS, check_counts
 from acmr.storage.run_dir import RunDir
 from sweeps.estimate import estimate
 from sweeps.folder import SweepFolder
@@ -137,6 +139,31 @@ def test_two_jobs_for_one_directory_are_refused(out):
     assert "the same run twice" in refusal(*product(out, seed=["1", "1"]))
 
 
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["seed=range(3,1)"], "seed=range(3,1): holds no value; type them one by one"),
+        (["agent.q_lr=range(1e-3,1e-4,1e-4)"], "holds no value"),
+        (["seed=range(0,1,0)"], "seed=range(0,1,0): range() arg 3 must not be zero; type a step other than 0"),
+        (["seed=range(0,1000000000)"], "these are more than 100,000 runs; sweep fewer values"),
+        (["seed=shuffle(range(0,1000000000))"], "these are more than 100,000 runs"),
+        (["seed=range(400)", "agent.q_lr=range(0.001,0.4,0.001)"], "these are more than 100,000 runs"),
+        (["seed=interval(1,2)"], "seed=interval(1,2): has no end; sweep a list, as in seed=1,2, or range(1,3)"),
+    ],
+)
+def test_what_is_swept_has_values_and_an_end(words, says):
+    began = time.perf_counter()
+    with pytest.raises(ConfigError) as caught:
+        check_counts(OverridesParser.create().parse_overrides(words))
+    assert says in str(caught.value)
+    assert time.perf_counter() - began < 2
+
+
+def test_as_many_runs_as_can_be_planned_are_swept():
+    for words in (["seed=1,2", "env=ant"], ["env=ant"], ["freeze=true,false", f"seed=range({MOST_RUNS // 2})"]):
+        check_counts(OverridesParser.create().parse_overrides(words))
+
+
 def test_a_directory_with_other_settings_is_refused(out):
     spec = expand([[out]])[0]
     finish(replace(spec, config=replace(spec.config, threshold=1.0)))
@@ -154,7 +181,7 @@ def test_a_teacher_that_is_named_but_not_there_is_refused(out, tmp_path):
         (product(experiment=["H0", "B7"]), "experiment=B7: must be one of A0"),
         (product(freeze=["true", "2"], transfer=["hidden"]), "freeze=2: must be true or false"),
         (product(transfer=["none", "hidden"], freeze=["true"]), "nothing to freeze"),
-        (product(sed=["1", "2"]), "did you mean seed?"),
+        (product(sed=["1", "2"]), "did you mean seed or seeding?"),
         (product(seed=["1", "x"]), "seed=x"),
     ],
 )

@@ -41,9 +41,9 @@ def _train_as_typed() -> None:
 
     from acmr.app.other_sweepers import with_their_words
     from acmr.settings.command_line import hydra_arguments
-    from acmr.settings.compose import CONFIG_FOLDER, register_schema
+    from acmr.settings.compose import CONFIG_FOLDER, register_schema, sources
 
-    with with_their_words(hydra_arguments(sys.argv[1:])) as arguments:
+    with with_their_words(hydra_arguments(sys.argv[1:])) as arguments, sources().refusing_circles():
         sys.argv[1:] = arguments
         register_schema()
         # The folder's own path: Hydra would look beside this file, which may have been called through a link.

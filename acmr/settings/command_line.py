@@ -27,6 +27,8 @@ SEARCH_PATH = "hydra.searchpath"
 RENAME = "transfer.rename"
 #: What works something out, from a variable for instance, which an answer would repeat.
 _CALL = re.compile(r"\$\{[^}]*:")
+#: What may be asked of a shell's completion.
+_COMPLETION = ("install", "uninstall", "query")
 #: What Hydra reads as another thing than a name.
 _NO_NAME = re.compile(r"null|true|false|[-+]?[0-9.]+", re.IGNORECASE)
 
@@ -137,6 +139,13 @@ def _check_options(given: Sequence[str]) -> argparse.Namespace:
         raise ConfigError(f"{error}; {typed()} --hydra-help lists the options") from error
     if known.config_dir is not None and not Path(known.config_dir).is_dir():
         raise ConfigError(f"--config-dir {known.config_dir}: there is no such folder")
+    if known.resolve and not (known.cfg or known.help):
+        raise ConfigError(f"--resolve: goes with --cfg, as in {typed()} --cfg job --resolve")
+    if known.shell_completion and sum(word.partition("=")[0] in _COMPLETION for word in known.overrides) != 1:
+        raise ConfigError(f'--shell-completion: type eval "$({typed()} -sc install=bash)", or uninstall=bash')
+    if known.experimental_rerun is not None:
+        # A pickle, which may hold code; no run of ours leaves one.
+        raise ConfigError("--experimental-rerun: is not offered; the same command again resumes a run")
     if unknown and not unknown[0].startswith("-"):
         raise ConfigError(f"{unknown[0]}: stands behind an option; options such as -m go before all settings")
     if unknown:

@@ -28,6 +28,7 @@ from acmr.settings.files import read_files_with_care
 from acmr.settings.sources import SWEEPS, Sources
 from acmr.settings.validate import validate
 from acmr.settings.variables import refuse_variables
+from acmr.text import holds_userinfo
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 #: The project's settings files: within the package where it is installed, beside it in a checkout.
@@ -87,6 +88,15 @@ def _expand_paths(config: ExperimentConfig) -> None:
             continue
         if not value.strip():
             raise ConfigError(f"{key}=: a path is needed, as in {key}={'runs' if key == 'output_dir' else 'FOLDER'}")
+        # Each would become a folder of that name, in which nobody looks for runs. One with a password in it is refused
+        # below, in a line that does not repeat it.
+        if "://" in value and not holds_userinfo(value):
+            raise ConfigError(f"{key}={value}: is an address; type a folder of this machine, as in {key}=FOLDER")
+        if re.match(r"\$\w|\$\{", value):
+            raise ConfigError(
+                f"{key}={value}: is not looked up here; let the shell do it, without single quotes around it, "
+                f"or type ./{value} for a folder of that name"
+            )
         # A shell does so at the beginning of a word only, not behind an equal sign.
         path = os.path.expanduser(value)
         if path.startswith("~"):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import asdict
 from difflib import get_close_matches
 from shlex import quote
 
@@ -19,7 +20,7 @@ from acmr.command import typed
 from acmr.config import ConfigError, ExperimentConfig, flatten
 from acmr.names import terminal
 from acmr.settings.compose import groups, launchers, options, setting_keys, sources, unknown_key
-from acmr.settings.files import place_of_key, place_of_text
+from acmr.settings.files import place_of_key, place_of_text, wrong_kind
 from acmr.text import message, without_userinfo
 
 #: Settings whose entries are free; Hydra adds to them with a plus sign only.
@@ -77,8 +78,6 @@ def check_booleans(overrides: Sequence[str]) -> None:
     Raises:
         ConfigError: Naming the setting and what to type.
     """
-    from dataclasses import asdict
-
     flat = flatten(asdict(ExperimentConfig()))
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.key_or_group
@@ -112,6 +111,12 @@ def _wrong_file(file: str, reason: str, key: str) -> str:
     place, path = sources().file(file)
     if re.match(r"Key '.*' (is )?not in", reason):
         return f"{place}: {unknown_key(key)}{place_of_key(path, key)}"
+    if not re.search(r"Value '.*' of type", reason):
+        # Of a value in the place of a group, or the other way round, OmegaConf does not say where.
+        known = asdict(ExperimentConfig())
+        inside = "" if file.startswith(("experiment/", "profile/", "matrix/")) else file.rpartition("/")[0]
+        if what := wrong_kind(path, known, inside):
+            return f"{place}: {what}"
     return f"{place}: {f'{key}: ' if key else ''}{reason}{place_of_key(path, key)}"
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import traceback
 from collections.abc import Callable
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +92,9 @@ def _wrong(file: Path | None, error: Exception) -> str:
         return f"not readable as YAML: {_explained(error)}"
     if isinstance(error, OSError) and error.strerror:
         return f"cannot be read ({error.strerror})"
+    if isinstance(error, ValueError):
+        # Of a number with too many digits, or a day that is in no calendar.
+        return f"not readable as YAML: {message(error)}"
     return "holds no settings; write key: value"
 
 
@@ -144,6 +149,52 @@ def _checked(source: ConfigSource, name: str, result: ConfigResult) -> ConfigRes
                 f"{place}: defaults: {entry}: the file builds on itself; name another one{place_of_text(file, own)}"
             )
     return result
+
+
+def circle_of(error: RecursionError) -> list[str]:
+    """The files that Hydra was following when it gave up, as ``env/ant``; none if something else had no end.
+
+    Each builds on the next one, and the last on the first.
+    """
+    # Private, read in hydra-core 1.3.8: its function for one file calls itself for those that the file builds on.
+    frames = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
+    paths = (frame.f_locals.get("path") for frame in frames if frame.f_code.co_name == "_create_defaults_tree_impl")
+    names = [str(path) for path in paths if path is not None]
+    for end, name in enumerate(names):
+        if (start := names.index(name)) < end:
+            return names[start:end]
+    return []
+
+
+def wrong_kind(file: Path | None, schema: Any, key: str) -> str | None:
+    """What part of a file is a value where a list or a mapping is needed, or one of these in the place of the other.
+
+    Args:
+        file: The file, if it is one.
+        schema: The settings as nested dictionaries, lists and values.
+        key: Where in the settings the file belongs; empty: it holds all of them.
+    """
+    part = reduce(lambda inner, name: inner.get(name, {}), filter(None, key.split(".")), schema)
+    return _wrong_kind(_nodes(file), part, key)
+
+
+_KINDS: dict[type, tuple[type[yaml.Node], str]] = {
+    dict: (yaml.MappingNode, "holds settings: write each on a line of its own below it, as key: value"),
+    list: (yaml.SequenceNode, "must be a list, as in [a, b]"),
+}
+
+
+def _wrong_kind(node: yaml.Node | None, part: Any, key: str) -> str | None:
+    kind, needed = _KINDS.get(type(part), (yaml.Node, ""))
+    if node is None or getattr(node, "tag", "").endswith(":null"):
+        return None
+    if not isinstance(node, kind):
+        return f"{f'{key}: ' if key else ''}{needed}{position(node.start_mark)}"
+    if not isinstance(node, yaml.MappingNode) or not isinstance(part, dict):
+        return None
+    entries = ((name.value, value) for name, value in node.value if name.value in part)
+    found = (_wrong_kind(value, part[name], f"{key}.{name}".lstrip(".")) for name, value in entries)
+    return next(filter(None, found), None)
 
 
 def place_of_key(file: Path | None, key: str) -> str:

@@ -7,6 +7,7 @@ import os
 import shlex
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +22,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict
 
 from acmr.config import ConfigError
-from acmr.settings.files import THEIRS, read_files_with_care, shown
+from acmr.settings.files import THEIRS, circle_of, read_files_with_care, shown
 
 #: The project's own matrices, found like a user's groups.
 SWEEPS = "pkg://sweeps"
@@ -52,10 +53,29 @@ class Sources:
     def compose(self, overrides: list[str]) -> DictConfig:
         """Composes the settings, without those of Hydra."""
         loader = _loader(self.paths)
-        cfg = loader.load_configuration(self.name, overrides, run_mode=RunMode.RUN, from_shell=False)
+        with self.refusing_circles():
+            cfg = loader.load_configuration(self.name, overrides, run_mode=RunMode.RUN, from_shell=False)
         with open_dict(cfg):
             del cfg["hydra"]
         return cfg
+
+    @contextmanager
+    def refusing_circles(self) -> Iterator[None]:
+        """Tells which files build on each other where Hydra, which follows them without end, has given up.
+
+        Raises:
+            ConfigError: If files do so.
+        """
+        try:
+            yield
+        except RecursionError as error:
+            circle = circle_of(error)
+            if not circle:
+                raise
+            first, *others = [self.file(name)[0] for name in circle]
+            raise ConfigError(
+                f"{first}: defaults: builds on {', which builds on '.join([*others, first])}; name another file in one"
+            ) from None
 
     def groups(self) -> list[str]:
         """The groups of settings files, such as ``env``."""
