@@ -39,6 +39,7 @@ def main() -> int:
 def _train_as_typed() -> None:
     import hydra
 
+    from acmr.app.meanings import register_help
     from acmr.app.other_sweepers import with_their_words
     from acmr.settings.command_line import hydra_arguments
     from acmr.settings.compose import CONFIG_FOLDER, register_schema, sources
@@ -46,6 +47,7 @@ def _train_as_typed() -> None:
     with with_their_words(hydra_arguments(sys.argv[1:])) as arguments, sources().refusing_circles():
         sys.argv[1:] = arguments
         register_schema()
+        register_help(sources())
         # The folder's own path: Hydra would look beside this file, which may have been called through a link.
         hydra.main(version_base="1.3", config_path=str(CONFIG_FOLDER), config_name="config")(_train)()
 

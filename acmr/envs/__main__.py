@@ -12,6 +12,7 @@ from acmr.envs import describe
 from acmr.envs.construct import find_spec, gym_ids
 from acmr.envs.wrappers import near_matches
 from acmr.names import terminal
+from acmr.settings.command_line import use_folder
 from acmr.settings.compose import environment_config, options
 from acmr.settings.errors import USER_ERRORS, explain
 
@@ -56,9 +57,12 @@ def main() -> int:
     """Runs the command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog=typed("envs"), description=__doc__)
     parser.add_argument("name", nargs="?", metavar="NAME", help="an environment of conf/env, or any Gymnasium id")
-    name = parser.parse_args().name
+    parser.add_argument("--config-dir", metavar="FOLDER", help="settings files of your own, as for training")
+    given = parser.parse_args()
+    name = given.name
     add_own_modules()
     try:
+        use_folder(given.config_dir)
         for line in overview() if name is None else details(name):
             print(terminal(line))
     except USER_ERRORS as error:

@@ -15,13 +15,14 @@ from pathlib import Path
 
 import torch
 
-from acmr.command import typed
+from acmr.command import add_own_modules, typed
 from acmr.config import IMPUTATIONS, MEAN, ConfigError
 from acmr.evaluation.camera import without_gl
 from acmr.evaluation.evaluate import evaluate, still
 from acmr.evaluation.video import FILM_SUFFIXES
 from acmr.names import terminal
 from acmr.records import EVALUATION_FILE, MOST_SEED
+from acmr.settings.command_line import use_folder
 
 #: Of one side of a picture, and of a film.
 _MOST_PIXELS, _MOST_SECONDS = 8192, 1e6
@@ -32,6 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = _parse(list(sys.argv[1:] if arguments is None else arguments))
     torch.set_num_threads(1)
     try:
+        add_own_modules()
+        use_folder(given.config_dir)
         with without_gl():
             importlib.import_module("acmr.envs")
         given.action(given)
@@ -46,7 +49,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         parser = argparse.ArgumentParser(prog=f"{typed('evaluate')} still", description=still.__doc__)
         parser.add_argument("environment", help="an environment of conf/env, or any Gymnasium id")
         parser.add_argument("--out", type=Path, required=True, metavar="FILE.png")
-        _add_size(parser)
+        _add_common(parser)
         parser.set_defaults(action=still)
         return parser.parse_args(arguments[1:])
     parser = argparse.ArgumentParser(
@@ -76,7 +79,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument(
         "--seconds", type=_seconds, metavar="S", help="of the film: S seconds of simulated time, episode after episode"
     )
-    _add_size(parser)
+    _add_common(parser)
     parser.add_argument("--out", type=Path, metavar="FILE.json", help=f"default: RUN_DIR/{EVALUATION_FILE}")
     parser.set_defaults(action=evaluate)
     given = parser.parse_args(arguments)
@@ -94,7 +97,8 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     return given
 
 
-def _add_size(parser: argparse.ArgumentParser) -> None:
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--config-dir", metavar="FOLDER", help="settings files of your own, as for training")
     for name in ("--width", "--height"):
         parser.add_argument(name, type=_pixels, default=480, metavar="PIXELS", help="of the picture; default: 480")
 

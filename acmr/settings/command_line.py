@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from shlex import quote
 
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -14,7 +16,7 @@ from hydra.errors import OverrideParseException
 
 from acmr.command import typed
 from acmr.config import ConfigError
-from acmr.settings.compose import CONFIG_FOLDER, PATH_KEYS, as_override, groups, look_in, options
+from acmr.settings.compose import CONFIG_FOLDER, PATH_KEYS, as_override, groups, look_in, options, sources
 from acmr.settings.sources import SWEEPS, Sources
 from acmr.settings.validate import NO_USERINFO
 from acmr.text import holds_userinfo, without_userinfo
@@ -52,6 +54,19 @@ def hydra_arguments(given: Sequence[str]) -> list[str]:
     arguments = [_in_hydras_words(_absolute(argument, chosen.config_path)) for argument in given]
     several = any(argument.partition("=")[0] in SWEEP_WORDS for argument in given)
     return ["--multirun", *arguments] if several else arguments
+
+
+def use_folder(folder: str | Path | None) -> None:
+    """Finds settings in a folder of the user's, too: ``--config-dir`` for programs that Hydra does not start.
+
+    Raises:
+        ConfigError: If there is no such folder.
+    """
+    if folder is not None:
+        words = ("--config-dir", str(folder))
+        hydra_arguments(words)
+        # Commands that messages print have to find the same files.
+        look_in(replace(sources(), words=tuple(map(quote, words))))
 
 
 def _absolute(argument: str, config_path: str | None) -> str:
