@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from torture import ANT, HUMANOID, SMALL, Run, at_step, same
+from torture import ANT, HUMANOID, SMALL, Run, at_step, found_out, same
 
 pytestmark = pytest.mark.slow
 
@@ -24,6 +24,8 @@ def untouched(tmp_path_factory):
 
     def of(overrides: tuple[str, ...]) -> tuple[dict[str, bytes], float]:
         if overrides not in made:
+            # What all of its processes know from the first; else a kill would mostly come after the end.
+            found_out(overrides)
             began = time.monotonic()
             outcome = Run(tmp_path_factory.mktemp("untouched"), overrides).finish()
             made[overrides] = outcome, time.monotonic() - began
@@ -34,7 +36,10 @@ def untouched(tmp_path_factory):
 
 def kill_after(run: Run, seconds: float, number: int = signal.SIGKILL) -> int:
     child = run.start()
-    time.sleep(seconds)
+    until, ended = time.monotonic() + seconds, os.WEXITED | os.WNOWAIT | os.WNOHANG
+    # One that came to its end before is not waited for; until it is asked for its code its number is its own.
+    while time.monotonic() < until and not os.waitid(os.P_PID, child, ended):
+        time.sleep(0.005)
     os.kill(child, number)
     return run.wait(child).code
 
