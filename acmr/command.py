@@ -42,6 +42,7 @@ SUBCOMMANDS = {
     "mirror": "acmr.tracking.mirror",
     "export": "acmr.exchange.exports",
     "import": "acmr.exchange.imports",
+    "tune": "acmr.app.tune",
 }
 #: Whether this is a checkout; looked up once, for later the place may be one that this process may not look into.
 _IN_CHECKOUT = os.path.isfile(Path(__file__).resolve().parents[1] / SUBCOMMANDS["train"])

@@ -251,7 +251,7 @@ class ExperimentConfig:
     log_every: int = 1_000
     #: Environment steps between two checkpoints; None: as the length of the run suggests; 0: none are made.
     checkpoint_every: int | None = None
-    #: What a sweeper of Hydra's is told of the run, one of :data:`METRICS` (:mod:`acmr.app.metric`).
+    #: What a search is told of the run: ``steps_to_threshold``, ``final_return``, ``area``, ``evaluation`` or ``none``.
     metric: str = NONE
     #: ``inexact`` goes on from a checkpoint of another machine or of other versions, and records that.
     resume: str = EXACT

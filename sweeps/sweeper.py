@@ -69,7 +69,11 @@ def run_sweep(jobs: Sequence[Sequence[str]], settings: Settings, config: DictCon
     _check(settings)
     look_in(sources_of(config.hydra, CONFIG_FOLDER))
     specs = expand(jobs)
-    plan, output_dir = make_plan(specs), Path(specs[0].config.output_dir)
+    return train_plan(make_plan(specs), Path(specs[0].config.output_dir), settings, config, context)
+
+
+def train_plan(plan: Plan, output_dir: Path, settings: Settings, config: DictConfig, context: HydraContext) -> int:
+    """Trains what is missing of a plan whose runs lie in a folder; the rest as :func:`run_sweep`."""
     threads = max(run.spec.config.threads for run in plan.runs)
     adapter = make_adapter(config, context, threads, settings.workers)
     workers = max(1, min(adapter.workers, len(plan.missing)))

@@ -15,7 +15,7 @@ from acmr.settings.compose import launchers
 
 _SWEEPER, _LAUNCHER, _FOLDER = "hydra/sweeper", "hydra/launcher", "hydra.sweep.dir"
 #: Ours; and the one that only tries all combinations, of which it keeps nothing that anybody needs.
-_OURS, _BASIC = "acmr", "basic"
+_OURS, _BASIC = ("acmr", "tune"), "basic"
 
 
 @contextmanager
@@ -27,8 +27,8 @@ def with_their_words(arguments: Sequence[str]) -> Iterator[list[str]]:
     """
     words = [word.partition("=") for word in arguments]
     chosen = {key.lstrip("+"): value for key, _, value in words}
-    sweeper, launcher = chosen.get(_SWEEPER, _OURS), chosen.get(_LAUNCHER)
-    if sweeper == _OURS:
+    sweeper, launcher = chosen.get(_SWEEPER, _OURS[0]), chosen.get(_LAUNCHER)
+    if sweeper in _OURS:
         yield list(arguments)
         return
     if launcher in launchers():
