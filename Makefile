@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 export PATH := $(BIN):$(PATH)
 
 
-.PHONY: help setup test test-slow torture mutations lint format demo paper status paper-figures report publish dashboard sync bench bench-check profile clean
+.PHONY: help setup test test-slow torture mutations lint format demo paper status paper-figures report publish dashboard sync bench bench-check profile docs clean
 
 help: ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
@@ -90,6 +90,10 @@ bench-check: $(READY) ## the same, and sweeps and analysis; fail if a figure fal
 
 profile: $(READY) ## where the time of a training step goes
 	python -m bench.profile_step
+
+docs: $(READY) ## this documentation as a site to be read offline, with a reference of the code: site/index.html
+	python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	python -m docs.site
 
 clean: ## remove what tools left; runs and results stay
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist *.egg-info

@@ -20,6 +20,8 @@ from docs.markdown import number, p_value, span, steps, table
 NAMED = [cell.name for cell in CELLS.values() if cell.transfer == "named"]
 
 
+#: Folder of the runs in the body with arms, beside those of the paper's profile: they are of no cell.
+ARMS_ADDED = "arms_added"
 #: What is said of a comparison, with its interval.
 _DIFFERENCES = ("difference", "restricted_difference")
 #: What the picture shows, and what it calls it.
@@ -83,24 +85,20 @@ def medians(found: Analysis) -> str:
 
 def added(found: Analysis, published: Path) -> str:
     """Runs in the body with arms whose teacher had none, beside H0 of the same seed."""
-    measured = found.measured[found.measured["counted"]]
-    own = measured[measured.index.str.startswith("humanoid-named")]
-    teachers = measured[measured["cell"] == "H0"].set_index("seed")["time"]
+    baseline = found.measured[found.measured["cell"] == "H0"].set_index("seed")["time"]
     rows = []
-    for name, run in own.sort_values("seed").iterrows():
-        folder = published / str(name)
-        taken = _read(folder / TRANSFER_FILE)
-        met = _read(folder / SUMMARY_FILE)["steps_to_threshold"]
-        source = taken["teacher"]
+    for file in sorted((published.parent / ARMS_ADDED).glob(f"*/*/{SUMMARY_FILE}"), key=lambda file: file.parent.name):
+        summary, taken = _read(file), _read(file.with_name(TRANSFER_FILE))
+        met = summary["steps_to_threshold"]
+        # Where the teacher lay is where it is published, but that its networks are in half precision here.
+        teacher = found.measured.loc["/".join(Path(taken["teacher"]["path"]).parts[-3:-1])]
         rows.append(
             [
-                *(int(run["seed"]), f"A0 seed {source['seed']}, {source['global_step']:,} steps"),
-                *(f"{met:,}" if met else "not reached", steps(teachers.get(run["seed"], float("nan")))),
-                *_evaluation(folder),
+                *(summary["seed"], f"{teacher['cell']} seed {teacher['seed']}, {steps(teacher['time'])} steps"),
+                *(f"{met:,}" if met else "not reached", steps(baseline[summary["seed"]])),
+                *_evaluation(file.parent),
             ]
         )
-    if not rows:
-        return "No run of it is published yet."
     heads = ["seed", "teacher", "steps to threshold", "H0 of that seed", "then, mean return", "ended in a fall"]
     return table([*heads, "m/s"], rows)
 

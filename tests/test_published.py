@@ -15,7 +15,7 @@ import yaml
 from safetensors.numpy import load_file
 
 from acmr.config import HORIZON, STOP_KEYS
-from acmr.settings.compose import compose_config, parse
+from acmr.settings.compose import as_override, compose_config, parse
 from acmr.storage.run_dir import differing_keys
 from analysis.analyze import analyze
 from analysis.loading.load import load
@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PUBLISHED = ROOT / "results" / "paper"
 TEACHER = PUBLISHED / "humanoid-none" / "seed_1"
 RUNS = sorted(path.parent for path in PUBLISHED.glob("*/*/summary.json"))
+ADDED = sorted(path.parent for path in (ROOT / "results" / "arms_added").glob("*/*/summary.json"))
 
 
 @cache
@@ -99,6 +100,26 @@ def test_a_student_learns_from_the_published_teacher(tmp_path):
         for name in (f"{layer}.weight", f"{layer}.bias"):
             assert student[name].tobytes() == teacher[name].tobytes(), name
     assert np.isfinite(student["actor.mean.weight"]).all()
+
+
+@pytest.mark.parametrize("run", ADDED, ids=lambda run: run.name)
+def test_each_with_arms_again_is_what_the_page_says(run):
+    summary = json.loads((run / "summary.json").read_text())
+    teacher = json.loads((run / "transfer.json").read_text())["teacher"]
+    words = ["env=humanoid", "transfer=named", f"seed={summary['seed']}", "stop=threshold", "stop_after=500000"]
+    meant = parse(compose_config([*words, f"transfer.teacher={as_override(teacher['path'])}"]))
+    assert differing_keys(yaml.safe_load((run / "config.yaml").read_text()), meant) == []
+    assert not summary["git_commit"].endswith("-dirty")
+    assert teacher["environment"] == "armless_humanoid"
+    # Of the students by name whose teacher was H0 of this seed, the one that returned most without arms.
+    students = {
+        other.relative_to(PUBLISHED).as_posix(): json.loads((other / "evaluation.json").read_text())["mean_return"]
+        for other in RUNS
+        if "-named" in other.parent.name
+        and json.loads((other / "transfer.json").read_text())["teacher"]["seed"] == summary["seed"]
+    }
+    assert f"runs/paper/{max(students, key=lambda name: students[name])}/" in teacher["path"]
+    assert analyze(load(ADDED[0].parent.parent)).measured["steps_to_threshold"].notna().all()
 
 
 def test_the_published_runs_are_taken_up_by_the_matrix(tmp_path):

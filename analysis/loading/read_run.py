@@ -48,7 +48,7 @@ class FoundRun:
     """What lies in one directory.
 
     Attributes:
-        row: What is known of the run, by the columns of :attr:`analysis.loading.load.RunSet.runs`.
+        row: What is known of the run, by the columns of the table ``runs`` of :class:`~analysis.loading.load.RunSet`.
         episodes: Its episodes, empty if they cannot be read.
         config: Its settings, empty if there are none.
         summary: Its summary, empty if there is none.
