@@ -58,8 +58,8 @@ paper: $(READY) ## the paper's 21 runs, a million steps each, then its tables an
 	python run.py matrix=paper output_dir=$(RUNS)
 	@python -m analysis $(RUNS)/paper --out results/paper
 
-status: $(READY) ## what every run is doing; fails if one failed
-	@python -m sweeps.status $(RUNS)
+status: $(READY) ## what every run is doing; fails if one failed; ARGS=--watch goes on looking
+	@python -m sweeps.status $(RUNS) $(ARGS)
 
 paper-figures: $(READY) ## every table and figure from the runs of PROFILE (default: paper)
 	python -m analysis $(RUNS)/$(PROFILE) --out results/$(PROFILE)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from rich.console import Group
 from rich.live import Live
-from rich.text import Text
 
 from acmr.cells import stops
 from acmr.command import PROGRAM
@@ -19,17 +18,15 @@ from acmr.names import terminal
 from acmr.records import COMPLETE, DIVERGED, ENDED, FAILED, RUNNING, STOPPED
 from acmr.text import duration, size
 from sweeps.estimate import Estimate
-from sweeps.folder import FINAL, OUTPUT_FILE, WAITING, SweepFolder, SweepRun
+from sweeps.folder import FINAL, OUTPUT_FILE, SweepFolder, SweepRun
 from sweeps.plan import Plan, PlannedRun
-from sweeps.table import counts, make_console, reasons, run_table
+from sweeps.table import counts, make_console, one_screen
 from sweeps.view import BLOCKED, LOST, RunStatus, steps_ahead, view_entries
 
 #: Seconds between two plain lines on how far everything is.
 LINE_INTERVAL = 60.0
 #: Seconds after which the average speed since the start says more than the present one.
 _SETTLED = 30.0
-#: Lines on why runs are in their states, and rows of runs, that the live table has where the terminal is low.
-_MOST_REASONS, _FEWEST_ROWS = 3, 3
 
 
 class Display:
@@ -134,19 +131,7 @@ class Display:
         return (self._steps() - self._first_steps) / elapsed if elapsed > _SETTLED else now
 
     def _drawing(self) -> Group:
-        whole = Text(self.line(), style="bold")
-        why = reasons(self.views)[:_MOST_REASONS]
-        for line in why:
-            line.no_wrap, line.overflow = True, "ellipsis"
-        lines_below = len(why) + len(whole.wrap(self._console, self._console.width))
-        # Two more for the header and for the line that the cursor is in.
-        height = max(self._console.height - lines_below - 2, _FEWEST_ROWS)
-        shown = self.views
-        if len(shown) > height:
-            # What runs or went wrong first; the rest is in the line below.
-            quiet = (COMPLETE, WAITING)
-            shown = sorted(self.views, key=lambda view: (view.state in quiet, view.state))[:height]
-        return Group(run_table(shown, self._console), *why, whole)
+        return one_screen(self.views, self.line(), self._console)
 
 
 def print_plan(plan: Plan, needs: Estimate, workers: int, output_dir: Path) -> None:

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
 
 from acmr.command import command, typed
 from acmr.foreign import is_file
@@ -15,11 +20,13 @@ from acmr.records import CONFIG_FILE, FAILED, RUNNING, SEED_FOLDER, STATUS_FILE
 from acmr.run_folders import RunFolder, run_folders
 from acmr.text import duration
 from sweeps.folder import WAITING, State, SweepFolder, SweepRun, all_folders
-from sweeps.table import counts, make_console, reasons, run_table
+from sweeps.table import counts, make_console, one_screen, reasons, run_table
 from sweeps.view import BLOCKED, LOST, RunStatus, steps_ahead, view_entries, view_run
 
 #: States for which somebody has to do something.
 _BAD = (FAILED, LOST, BLOCKED)
+#: Seconds between two looks, at most.
+_LONGEST = 86_400
 
 
 def all_runs(output_dir: Path, folders: Iterable[RunFolder]) -> list[RunStatus]:
@@ -76,25 +83,55 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Prints the table; returns the exit code."""
     parser = argparse.ArgumentParser(prog=typed("status"), description=__doc__)
     parser.add_argument("output_dir", nargs="?", type=Path, default=Path("runs"), help="folder of all runs (runs)")
-    output_dir = parser.parse_args(arguments).output_dir
-    if not output_dir.is_dir():
-        print(f"{output_dir}: no runs there yet; {typed()} trains one")
+    watching = "in a terminal: look again every SECONDS (2), until no run is under way or Ctrl-C"
+    parser.add_argument("--watch", nargs="?", type=_interval, const=2.0, metavar="SECONDS", help=watching)
+    given = parser.parse_args(arguments)
+    if not given.output_dir.is_dir():
+        print(f"{given.output_dir}: no runs there yet; {typed()} trains one")
         return 0
-    output_dir = output_dir.absolute()
+    output_dir, console = given.output_dir.absolute(), make_console()
+    if given.watch is not None:
+        if not console.is_terminal:
+            parser.error("--watch: needs a terminal; leave it out")
+        _watch(output_dir, given.watch, console)
     folders = run_folders(output_dir)
     views = all_runs(output_dir, folders)
-    console = make_console()
     console.print(run_table(views, console))
     for line in reasons(views):
         console.print(line, soft_wrap=True)
     for folder in folders:
         if folder.problem:
             console.print(terminal(f"{folder.path}: {folder.problem}"), markup=False, soft_wrap=True)
-    running = [view for view in views if view.state == RUNNING]
-    speed = sum(view.speed for view in running)
-    eta = f"; {speed:,.0f} steps/s, {duration(steps_ahead(views) / speed)} left" if speed else ""
-    console.print(f"{len(views)} runs: {counts(views)}{eta}", style="bold", markup=False, soft_wrap=True)
+    console.print(_whole(views), style="bold", markup=False, soft_wrap=True)
     return 1 if any(view.state in _BAD for view in views) else 0
+
+
+def _watch(output_dir: Path, interval: float, console: Console) -> None:
+    """Shows one screen of all runs, again and again."""
+    with suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False, transient=True) as live:
+        console.show_cursor(True)  # left hidden, it would stay so after a kill
+        while True:
+            views = all_runs(output_dir, run_folders(output_dir))
+            live.update(one_screen(views, _whole(views), console), refresh=True)
+            if not any(view.state in (RUNNING, WAITING) for view in views):
+                break
+            time.sleep(interval)
+
+
+def _whole(views: Sequence[RunStatus]) -> str:
+    speed = sum(view.speed for view in views if view.state == RUNNING)
+    eta = f"; {speed:,.0f} steps/s, {duration(steps_ahead(views) / speed)} left" if speed else ""
+    return f"{len(views)} runs: {counts(views)}{eta}"
+
+
+def _interval(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0.1 <= seconds <= _LONGEST:
+        raise argparse.ArgumentTypeError(f"{text}: seconds from 0.1 to {_LONGEST:,} are needed, as in --watch 2")
+    return seconds
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Sequence
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
@@ -16,6 +16,8 @@ from acmr.text import UNLIMITED, duration, shorten
 from sweeps.folder import WAITING
 from sweeps.view import BLOCKED, LOST, RunStatus
 
+#: Lines on why runs are in their states, and rows of runs, that a table has where the terminal is low.
+_MOST_REASONS, _FEWEST_ROWS = 3, 3
 _COLORS = {COMPLETE: "green", DIVERGED: "magenta", FAILED: "red", RUNNING: "cyan", LOST: "red", BLOCKED: "red"}
 #: Names with fewer characters are hard to tell apart; rather than that, the table says less about each run.
 _SHORT_NAME = 16
@@ -46,6 +48,22 @@ def run_table(views: Sequence[RunStatus], console: Console) -> Table:
         # As texts, because a name may hold what looks like rich's markup.
         table.add_row(*map(Text, cells), style=_COLORS.get(view.state))
     return table
+
+
+def one_screen(views: Sequence[RunStatus], whole: str, console: Console) -> Group:
+    """The table, why runs are in their states, and a line on the whole, as far as the terminal is high."""
+    line = Text(whole, style="bold")
+    why = reasons(views)[:_MOST_REASONS]
+    for text in why:
+        text.no_wrap, text.overflow = True, "ellipsis"
+    lines_below = len(why) + len(line.wrap(console, console.width))
+    # Two more for the header and for the line that the cursor is in.
+    height = max(console.height - lines_below - 2, _FEWEST_ROWS)
+    if len(views) > height:
+        # What runs or went wrong first; the rest is in the line below.
+        quiet = (COMPLETE, WAITING)
+        views = sorted(views, key=lambda view: (view.state in quiet, view.state))[:height]
+    return Group(run_table(views, console), *why, line)
 
 
 def counts(views: Iterable[RunStatus]) -> str:

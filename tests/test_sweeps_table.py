@@ -4,10 +4,12 @@ import fcntl
 import io
 import os
 import pty
+import signal
 import struct
 import subprocess
 import sys
 import termios
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -132,22 +134,32 @@ def test_what_goes_through_a_pipe_is_not_cropped(tmp_path):
     assert "\x1b" not in told.stdout
 
 
-@pytest.mark.parametrize("width", [40, 80, 120])
-def test_make_status_fits_a_real_terminal(tmp_path, width):
+def in_a_terminal(command: list[str], width: int, height: int = 24) -> tuple[subprocess.Popen[bytes], int]:
+    """A program in a terminal of its own, and our end of that."""
     ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, width, 0, 0))
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", height, width, 0, 0))
     variables = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "LINES", "NO_COLOR")}
     process = subprocess.Popen(
-        some_runs(tmp_path), stdin=theirs, stdout=theirs, stderr=theirs, env={**variables, "TERM": "xterm"}
+        command, stdin=theirs, stdout=theirs, stderr=theirs, env={**variables, "TERM": "xterm"}, start_new_session=True
     )
     os.close(theirs)
+    return process, ours
+
+
+def read_until(terminal: int, end: bytes | None = None) -> bytes:
+    """What a terminal shows until it shows this, or until nobody writes to it any more."""
     said = b""
     # Linux ends a terminal that nobody writes to any more with an error.
-    try:
-        while part := os.read(ours, 65536):
+    with suppress(OSError):
+        while (end is None or end not in said) and (part := os.read(terminal, 65536)):
             said += part
-    except OSError:
-        pass
+    return said
+
+
+@pytest.mark.parametrize("width", [40, 80, 120])
+def test_make_status_fits_a_real_terminal(tmp_path, width):
+    process, ours = in_a_terminal(some_runs(tmp_path), width)
+    said = read_until(ours)
     os.close(ours)
     assert process.wait() == 0, said
     assert b"\x1b[36m" in said, "what runs is colored"
@@ -158,3 +170,37 @@ def test_make_status_fits_a_real_terminal(tmp_path, width):
     ]  # fmt: skip
     assert all(len(line) <= width for line in lines)
     assert len({line.split()[0] for line in lines}) == 3
+
+
+def test_one_who_watches_sees_what_changes_until_nothing_runs(tmp_path):
+    process, ours = in_a_terminal([*some_runs(tmp_path), "--watch", "0.1"], 100, height=8)
+    read_until(ours, b"2 running")
+    ended(tmp_path / "quick" / RATES[0] / "seed_1")
+    said = read_until(ours, b"1 running")
+    assert b"2 complete" in said
+    ended(tmp_path / "quick" / RATES[1] / "seed_1", "diverged")
+    last = Text.from_ansi(read_until(ours).decode().replace("\r", "")).plain.splitlines()
+    os.close(ours)
+    assert process.wait() == 0
+    assert last[-1] == "3 runs: 2 complete, 1 diverged"
+
+
+def test_one_who_has_seen_enough_is_left_with_the_table(tmp_path):
+    process, ours = in_a_terminal([*some_runs(tmp_path), "--watch", "60"], 100)
+    read_until(ours, b"2 running")
+    process.send_signal(signal.SIGINT)
+    said = read_until(ours)
+    os.close(ours)
+    assert process.wait() == 0
+    assert b"3 runs: 1 complete, 2 running" in said
+    assert b"Traceback" not in said
+
+
+@pytest.mark.parametrize(("words", "says"), [
+    (["--watch"], "--watch: needs a terminal"), (["--watch", "0"], "0: seconds from 0.1"),
+    (["--watch", "soon"], "soon: seconds from 0.1 to 86,400 are needed"), (["--watch=nan"], "nan: seconds"),
+])  # fmt: skip
+def test_what_cannot_be_watched_is_one_line(tmp_path, words, says):
+    told = subprocess.run([*some_runs(tmp_path), *words], capture_output=True, text=True, check=False)
+    assert told.returncode == 2
+    assert says in told.stderr.splitlines()[-1]
