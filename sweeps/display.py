@@ -162,7 +162,8 @@ def print_plan(plan: Plan, needs: Estimate, workers: int, output_dir: Path) -> N
 
 def command_line() -> str:
     """The command line as it was typed, not as Hydra got it; in a notebook Python's own is that of the kernel."""
-    if Path(sys.argv[0]).stem == PROGRAM:
+    # A subcommand has the name of its module in place of the program's.
+    if PROGRAM in (Path(sys.argv[0]).stem, *(Path(word).name for word in sys.orig_argv[1:2])):
         own = next(place for place, word in enumerate(sys.orig_argv) if Path(word).stem == PROGRAM)
         return shlex.join([PROGRAM, *sys.orig_argv[own + 1 :]])
     return shlex.join(["python", *(["run.py", *sys.argv[1:]] if "ipykernel" in sys.modules else sys.orig_argv[1:])])

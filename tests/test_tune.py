@@ -157,6 +157,16 @@ def test_it_finds_what_is_best_and_cuts_short_what_is_not(tmp_path, capsys):
     assert len(list((tmp_path / "it").glob("*.png"))) == 3
 
 
+def test_the_command_that_goes_on_is_the_one_that_was_typed(monkeypatch):
+    from sweeps.display import command_line
+
+    monkeypatch.setattr(sys, "argv", ["/somewhere/acmr/app/tune/__main__.py", "-m", "hydra/sweeper=tune", RATE])
+    monkeypatch.setattr(sys, "orig_argv", ["python3", "/venv/bin/acmr", "tune", RATE])
+    assert command_line() == f"acmr tune '{RATE}'"
+    monkeypatch.setattr(sys, "orig_argv", ["python3", "-m", "acmr.app.tune", RATE])
+    assert command_line() == f"python -m acmr.app.tune '{RATE}'"
+
+
 def test_all_seeds_at_once_where_nothing_is_cut_short(tmp_path):
     search = searched(tmp_path / "it", spaced(RATE, "seed=1,2,3"), trials=4, prune=False, workers=6)
     assert search.run() == 0

@@ -72,8 +72,7 @@ def _text(name: str, study: optuna.Study, space: Space, metric: str, importance:
     lines = [
         f"# Search {name}",
         "",
-        f"The best of {len(trials)} trials is trial {best.number}: {worth}, the mean of seeds "
-        f"{', '.join(map(str, space.seeds))} ({better}).",
+        f"The best of {len(trials)} trials is trial {best.number}: {worth}, {space.of_seeds} ({better}).",
         "",
         "```",
         space.command(best.params),

@@ -184,8 +184,7 @@ class Search:
     def _greet(self, ended: int, under_way: int) -> None:
         for line in self._space.lines():
             self._say(line)
-        seeds = ", ".join(map(str, self._space.seeds))
-        self._say(f"{'least' if self._less else 'greatest'} {self._metric}, mean of seeds {seeds}; {self._folder}")
+        self._say(f"{'least' if self._less else 'greatest'} {self._metric}, {self._space.of_seeds}; {self._folder}")
         if ended or under_way:
             self._say(f"going on: {ended} trials have ended, {under_way} were under way")
 

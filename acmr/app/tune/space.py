@@ -52,6 +52,12 @@ class Space:
         said = [*sources().words, *self.fixed, *self.words(params), seeds]
         return " ".join([typed(), "-m", *map(shlex.quote, said)])
 
+    @property
+    def of_seeds(self) -> str:
+        """What the value of a trial is of."""
+        said = ", ".join(map(str, self.seeds))
+        return f"of seed {said}" if len(self.seeds) == 1 else f"mean of seeds {said}"
+
     def lines(self) -> list[str]:
         """What is searched, for people."""
         return [f"{key}: {_described(choice)}" for key, choice in self.choices.items()]
