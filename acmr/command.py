@@ -13,6 +13,8 @@ import os
 import select
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
@@ -30,6 +32,8 @@ _Arguments = ParamSpec("_Arguments")
 INTERRUPTED = 130
 #: The exit code of what cannot be done.
 REFUSED = 2
+#: Seconds that threads of an environment's have when the program is over.
+_LAST_WAIT = 5.0
 #: The command of an installed program; its words for what is a module or a file of a checkout.
 PROGRAM = "acmr"
 SUBCOMMANDS = {
@@ -85,22 +89,63 @@ def command(main: Callable[_Arguments, int]) -> Callable[_Arguments, int]:
     @wraps(main)
     def run(*arguments: _Arguments.args, **more: _Arguments.kwargs) -> int:
         protect_streams()
+        before = set(threading.enumerate())
+        code = 1
         try:
             # Libraries ask for it as they are loaded, and some end the process where there is none.
             os.getcwd()
         except OSError as error:
             return _refused(f"the current folder is gone ({error.strerror}); cd to one that is there")
         try:
-            return main(*arguments, **more)
+            code = main(*arguments, **more)
         except KeyboardInterrupt:
-            return _interrupted()
+            code = _interrupted()
+        except SystemExit as ended:
+            code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+            raise
         except OSError as error:
             if error.errno is None:
                 raise
             place = f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes) else ""
-            return _refused(f"{place}{error.strerror}")
+            code = _refused(f"{place}{error.strerror}")
+        finally:
+            end_without(before, code)
+        return code
 
     return run
+
+
+def end_without(before: set[threading.Thread], code: int) -> None:
+    """Lets a thread that somebody's code has begun and never ends, an environment's for instance, not keep the process.
+
+    Python waits for such a thread when the program is over. It has a few seconds then.
+
+    Args:
+        before: Threads that were there before that code was run; they are their owner's business.
+        code: The exit code of the program.
+    """
+
+    def left() -> list[threading.Thread]:
+        return [thread for thread in threading.enumerate() if thread not in before and not thread.daemon]
+
+    def watch() -> None:
+        # Over as soon as the program's last line is; then those of thread pools are told to end, and do.
+        threading.main_thread().join()
+        until = time.monotonic() + _LAST_WAIT
+        while left():
+            if time.monotonic() > until:
+                names = terminal(", ".join(thread.name for thread in left()))
+                print(
+                    f"warning: a thread that is not this program's does not end ({names}); ended without it",
+                    file=sys.stderr,
+                )
+                for stream in (sys.stdout, sys.stderr):
+                    stream.flush()
+                os._exit(code)
+            time.sleep(0.05)
+
+    if left():
+        threading.Thread(target=watch, name="end", daemon=True).start()
 
 
 def end_at_ctrl_c() -> None:
@@ -148,12 +193,21 @@ def protect_streams() -> None:
     encoding lacks: what is printed is for people, and no work depends on it. Libraries print through the same streams.
     Streams that something else has put in their places, a notebook for instance, stay as they are.
     """
+    _keep_encoding_to_itself()
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is getattr(sys, f"__{name}__") and isinstance(stream, io.TextIOWrapper):
             stream = _protected(number, stream)
             setattr(sys, name, stream)
             setattr(sys, f"__{name}__", stream)
+
+
+def _keep_encoding_to_itself() -> None:
+    # Libraries ask a Python of their own what there is (GLFW where MuJoCo is loaded), and read its answer as ASCII.
+    encoding = os.environ.get("PYTHONIOENCODING", "").partition(":")[0]
+    with suppress(LookupError):
+        if encoding and "a\n".encode(encoding) != b"a\n":
+            del os.environ["PYTHONIOENCODING"]
 
 
 def _protected(number: int, stream: io.TextIOWrapper) -> io.TextIOWrapper:

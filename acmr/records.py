@@ -36,6 +36,8 @@ EVENTS_FOLDER = "tensorboard"
 #: A run's place below the folder of all runs is ``<profile>/<name>/seed_<n>``.
 #: The greatest seed: the greatest integer that every reader of CSV and JSON holds exactly.
 MOST_SEED = 2**53 - 1
+#: The most episodes in a row, and the greatest return in size, that a run is judged by.
+MOST_CONSECUTIVE, MOST_RETURN = 2**31, 1e100
 SEED_FOLDER = re.compile(r"seed_(\d+)")
 
 #: States of a run that is under way, was asked to stop or was ended by an error, as ``status.json`` names them.

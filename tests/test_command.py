@@ -30,6 +30,7 @@ USELESS = {
     "closed": "<&- >&- 2>&-",
     "open to be read only": "1</dev/null 2</dev/null",
     "ascii": "PYTHONIOENCODING=ascii",
+    "two bytes a letter": "PYTHONIOENCODING=utf-16",
     "latin-1, without a buffer": "PYTHONIOENCODING=latin-1 PYTHONUNBUFFERED=1",
 }
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "TERM": "xterm", "COLUMNS": "150"}
@@ -86,7 +87,30 @@ def test_the_other_commands_do_their_work_too(command: str, useless: str, runs: 
         assert word not in command or list(runs.glob(left))
 
 
-@pytest.mark.parametrize("useless", [">/dev/full 2>&1", "<&- >&- 2>&-"])
+#: A program of the kind that all commands are, in a moment: more lines than any buffer holds, and its end.
+SHORT = """-c "
+from acmr.command import command
+@command
+def main():
+    for stream in (sys.stdout, sys.stderr):
+        print('rüns ☃' * 20_000, file=stream, flush=True)
+    os.write(9, b'came to its end')
+    return 7
+import os, sys
+sys.exit(main())
+" 9>$RUNS/end """
+
+
+@pytest.mark.parametrize("useless", USELESS.values(), ids=USELESS)
+def test_no_stream_ends_what_is_made_a_command(useless: str, tmp_path: Path) -> None:
+    done = shell(SHORT, useless, tmp_path)
+    assert ended_well(done, 7), (done.returncode, done.stderr[-500:])
+    assert (tmp_path / "end").read_text() == "came to its end"
+
+
+@pytest.mark.parametrize(
+    "useless", [">/dev/full 2>&1", "<&- >&- 2>&-", "PYTHONIOENCODING=utf-16", "PYTHONIOENCODING=cp500"]
+)
 @pytest.mark.first_is_fast
 def test_a_training_comes_to_its_end(useless: str, tmp_path: Path) -> None:
     done = shell(TRAINING.replace("$RUNS", f"'{tmp_path / FOLDER}'"), useless, tmp_path)

@@ -16,7 +16,7 @@ from hydra.errors import OverrideParseException
 
 from acmr.command import typed
 from acmr.config import ConfigError
-from acmr.settings.compose import CONFIG_FOLDER, PATH_KEYS, as_override, groups, look_in, options, sources
+from acmr.settings.compose import CONFIG_FOLDER, PATH_KEYS, as_override, groups, look_in, options, setting_keys, sources
 from acmr.settings.sources import SWEEPS, Sources
 from acmr.settings.validate import NO_USERINFO
 from acmr.text import holds_userinfo, without_userinfo
@@ -29,6 +29,8 @@ SEARCH_PATH = "hydra.searchpath"
 RENAME = "transfer.rename"
 #: What works something out, from a variable for instance, which an answer would repeat.
 _CALL = re.compile(r"\$\{[^}]*:")
+#: A variable as a shell writes it, or as OmegaConf once did.
+_SHELLS = re.compile(r"\$\{(?:env:)?([A-Za-z_]\w*)[^}.]*\}")
 #: What may be asked of a shell's completion.
 _COMPLETION = ("install", "uninstall", "query")
 #: What Hydra reads as another thing than a name.
@@ -81,6 +83,7 @@ def _in_hydras_words(argument: str) -> str:
     if key in SWEEP_WORDS:
         return f"{SWEEP_WORDS[key]}{equal}{value}"
     if key.lstrip("+") in PATH_KEYS:
+        _refuse_shells_variable(key, value)
         return _quoted(key, value)
     if key.lstrip("+") == RENAME and value.startswith("{"):
         return _renamed(argument)
@@ -106,6 +109,17 @@ def _quoted(key: str, value: str) -> str:
     return argument
 
 
+def _refuse_shells_variable(key: str, value: str) -> None:
+    known = {setting.partition(".")[0] for setting in setting_keys()}
+    for match in _SHELLS.finditer(value):
+        if match[1] not in known and not match[0].startswith("${oc."):
+            home = " (your home is ~, too)" if match[1] == "HOME" else ""
+            raise ConfigError(
+                f"{key}={value}: {match[0]} is no setting; leave the single quotes out, so that the shell looks it up, "
+                f"or type ${{oc.env:{match[1]}}}{home}"
+            )
+
+
 def _renamed(argument: str) -> str:
     """``transfer.rename={old: new}`` as the list that the setting is, for Hydra adds no entries to a typed mapping."""
     try:
@@ -129,7 +143,9 @@ def _place(place: str) -> str:
     scheme, separator, path = place.rpartition("://")
     if scheme == "pkg" and find_spec(path.replace("/", ".").partition(".")[0]) is None:
         raise ConfigError(f"{SEARCH_PATH}: {place}: there is no such package")
-    if separator and scheme != "file":
+    if separator and scheme not in ("file", "pkg"):
+        raise ConfigError(f"{SEARCH_PATH}: {place}: a folder or a package is needed, as in FOLDER or pkg://PACKAGE")
+    if scheme == "pkg":
         return place
     folder = Path(path).expanduser()
     if not folder.is_dir():

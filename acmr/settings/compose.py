@@ -92,7 +92,7 @@ def _expand_paths(config: ExperimentConfig) -> None:
         # below, in a line that does not repeat it.
         if "://" in value and not holds_userinfo(value):
             raise ConfigError(f"{key}={value}: is an address; type a folder of this machine, as in {key}=FOLDER")
-        if re.match(r"\$\w|\$\{", value):
+        if re.match(r"\$[\w({]", value):
             raise ConfigError(
                 f"{key}={value}: is not looked up here; let the shell do it, without single quotes around it, "
                 f"or type ./{value} for a folder of that name"

@@ -28,7 +28,7 @@ from acmr.config import (
     flatten,
     share_of_mean,
 )
-from acmr.records import MOST_SEED
+from acmr.records import MOST_CONSECUTIVE, MOST_RETURN, MOST_SEED
 from acmr.text import holds_userinfo
 
 #: Settings are stored with the run.
@@ -52,8 +52,9 @@ def validate(config: ExperimentConfig) -> None:
     agent = config.agent
     _at_least("seed", config.seed, 0)
     _one_of("seeding", config.seeding, SEEDINGS)
-    for key in ("total_timesteps", "consecutive", "log_every"):
+    for key in ("total_timesteps", "log_every"):
         _at_least(key, getattr(config, key), 1)
+    _at_least("consecutive", config.consecutive, 1, MOST_CONSECUTIVE)
     _at_least("threads", config.threads, 1, MOST_THREADS)
     for key in ("batch_size", "buffer_size", "policy_frequency", "target_network_frequency"):
         _at_least(f"agent.{key}", getattr(agent, key), 1)
@@ -70,8 +71,11 @@ def validate(config: ExperimentConfig) -> None:
         _within(f"agent.{key}", getattr(agent, key), low=0.0, high=math.inf, low_open=True)
     _within("agent.tau", agent.tau, low=0.0, high=1.0, low_open=True)
     _within("agent.gamma", agent.gamma, low=0.0, high=1.0)
-    if not math.isfinite(config.threshold):
-        raise ConfigError(f"threshold={config.threshold}: a finite return is needed, as in threshold=4900")
+    if not abs(config.threshold) <= MOST_RETURN:
+        raise ConfigError(
+            f"threshold={config.threshold}: a finite return is needed, of at most {MOST_RETURN:g} in size, "
+            "as in threshold=4900"
+        )
     if not agent.hidden_sizes or min(agent.hidden_sizes) < 1:
         raise ConfigError(
             f"agent.hidden_sizes={agent.hidden_sizes}: one or more widths of at least 1 are needed, "

@@ -164,9 +164,7 @@ def _start(arguments: Mapping[str, Any], folder: Path, server: str | None) -> Ru
         import wandb
 
         # W&B has its own log files; a run's log and its terminal are no place for it.
-        logging.getLogger("wandb").propagate = False
-        # A line that such a file does not take, as of a path that is no text, is lost there and no matter for the user.
-        logging.raiseExceptions = False
+        _keep_to_itself(logging.getLogger("wandb"))
         settings = wandb.Settings(
             mode="online" if server else "offline",
             # W&B leaves all but the last second of a killed run.
@@ -201,6 +199,19 @@ def _start(arguments: Mapping[str, Any], folder: Path, server: str | None) -> Ru
     run.define_metric("global_step", hidden=True)
     run.define_metric("*", step_metric="global_step")
     return run
+
+
+def _keep_to_itself(logger: logging.Logger) -> None:
+    logger.propagate = False
+    add = logging.Logger.addHandler
+
+    def add_quiet(hdlr: logging.Handler) -> None:
+        # A line that its file does not take, as of a path that is no text, is lost there and no matter for the user.
+        hdlr.handleError = lambda record: None  # type: ignore[method-assign]
+        add(logger, hdlr)
+
+    # On this one logger only: W&B adds its files to it while it starts, and writes to them at once.
+    logger.addHandler = add_quiet  # type: ignore[method-assign]
 
 
 def end_service(exit_code: int) -> None:

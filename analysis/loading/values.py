@@ -9,7 +9,7 @@ from typing import Any
 
 from acmr import foreign
 from acmr.foreign import is_there
-from acmr.records import DamagedError
+from acmr.records import MOST_CONSECUTIVE, MOST_RETURN, DamagedError
 
 #: Whole numbers from here on are no longer exact as floats, and those of the seeds no longer numbers of 64 bits.
 MOST_STEPS, MOST_SEED = 2**53, 2**63 - 1
@@ -17,8 +17,8 @@ MOST_STEPS, MOST_SEED = 2**53, 2**63 - 1
 _NEEDED = {
     "seed": (0, MOST_SEED, True),
     **dict.fromkeys(("total_timesteps", "global_step", "stop_after", "episodes"), (0, MOST_STEPS, True)),
-    "consecutive": (1, 2**31, True),
-    "threshold": (-1e100, 1e100, False),
+    "consecutive": (1, MOST_CONSECUTIVE, True),
+    "threshold": (-MOST_RETURN, MOST_RETURN, False),
 }
 #: The same of what can be left out.
 _SHOWN = {
