@@ -157,6 +157,17 @@ def test_what_is_no_agent_of_cleanrl(content, says, tmp_path, capsys):
     refused(["cleanrl", tmp_path / "agent.pt"], says, tmp_path, capsys)
 
 
+def test_the_environment_may_be_of_a_folder_of_ones_own(tmp_path, capsys):
+    (tmp_path / "conf" / "env").mkdir(parents=True)
+    (tmp_path / "conf" / "env" / "pole.yaml").write_text(f"name: pole\nid: {PENDULUM}\nsource: pole\n")
+    path, out = write_sb3_model(tmp_path / "model.zip"), tmp_path / "out"
+    words = ["sb3", str(path), "--env", "pole", "--out", str(out)]
+    assert main([*words, "--config-dir", str(tmp_path / "gone")]) == 2
+    assert "there is no such folder" in capsys.readouterr().err
+    assert main([*words, "--config-dir", str(tmp_path / "conf")]) == 0
+    assert load_teacher(out).description.environment == "pole"
+
+
 def test_a_folder_that_holds_something_is_left_alone(tmp_path, capsys):
     path, out = write_sb3_model(tmp_path / "model.zip"), tmp_path / "out"
     out.mkdir()

@@ -20,6 +20,7 @@ from acmr.exchange.cleanrl import read_cleanrl
 from acmr.exchange.imported import Imported, Normalization, make_teacher
 from acmr.exchange.sb3_reader import read_sb3
 from acmr.names import terminal
+from acmr.settings.command_line import use_folder
 from acmr.settings.compose import environment_config
 from acmr.storage.durable import WriteError
 from acmr.text import one_line
@@ -111,12 +112,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", required=True, type=Path, metavar="FOLDER", help="of the teacher")
     parser.add_argument("--normalization", type=Path, metavar="FILE.npz", help="mean and var of its observations")
     parser.add_argument("--alpha", type=float, metavar="VALUE", help="its temperature, if the file does not say it")
+    parser.add_argument("--config-dir", metavar="FOLDER", help="settings files of your own, as for training")
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)
     add_own_modules()
     try:
         if given.out.is_file() or (given.out.is_dir() and any(given.out.iterdir())):
             raise ConfigError(f"--out {given.out}: holds something already; give a folder that is new or empty")
+        use_folder(given.config_dir)
         normalization = read_normalization(given.normalization) if given.normalization else None
         env = environment_config(given.env)
         found = _READERS[given.program][0](given.file)

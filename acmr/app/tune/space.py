@@ -49,8 +49,8 @@ class Space:
     def command(self, params: Mapping[str, Any]) -> str:
         """The command line that trains all seeds with what was chosen."""
         seeds = f"{SEED}={','.join(map(str, self.seeds))}"
-        said = [*sources().words, *self.fixed, *self.words(params), seeds]
-        return " ".join([typed(), "-m", *map(shlex.quote, said)])
+        said = [*self.fixed, *self.words(params), seeds]
+        return " ".join([typed(), "-m", *sources().words, *map(shlex.quote, said)])
 
     @property
     def of_seeds(self) -> str:
