@@ -87,3 +87,19 @@ def test_launchers_that_cannot_run_a_sweep_are_refused(tmp_path, launcher):
     assert done.stderr.startswith(
         f"error: hydra/launcher={launcher}: sweeps have no adapter for it; type hydra/launcher=local"
     )
+
+
+@pytest.mark.slow
+def test_bash_completes_groups_choices_and_settings():
+    asked = {
+        "transfer=h": "transfer=hidden",
+        "seeding=": "seeding=independent seeding=paired",
+        "agent.q": "agent.q_lr=",
+    }
+    lines = [f'PATH="{Path(sys.executable).parent}:$PATH"', 'eval "$(python run.py -sc install=bash)"', "COMP_CWORD=2"]
+    for typed in asked:
+        line = f"python run.py {typed}"
+        lines += [f'COMP_LINE="{line}"', "COMP_POINT=${#COMP_LINE}", f"COMP_WORDS=({line})", "COMPREPLY=()"]
+        lines += ["hydra_bash_completion", 'echo "${COMPREPLY[@]}"']
+    done = subprocess.run(["bash", "-c", "\n".join(lines)], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.stdout.splitlines() == list(asked.values()), done.stderr
