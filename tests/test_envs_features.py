@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
+from gymnasium.spaces import Box
 
 from acmr.config import EnvConfig
 from acmr.envs import describe, make_env
@@ -196,3 +197,62 @@ def test_without_a_model_names_are_indices() -> None:
     description = describe(of("Pendulum-v1"))
     assert description.observation_names == ("obs/0", "obs/1", "obs/2")
     assert description.action_names == ("action/0",)
+
+
+class OwnNames(gym.Env[np.ndarray, np.ndarray]):
+    """An environment that says what its numbers are, in one of the ways that there are."""
+
+    observation_space = Box(-1, 1, (4,), np.float32)
+    action_space = Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, **said: Any) -> None:
+        for name, value in said.items():
+            setattr(self, name, value)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        return np.zeros(4, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        return np.zeros(4, np.float32), 0.0, False, False, {}
+
+
+gym.register("AcmrOwnNames-v0", OwnNames, max_episode_steps=20)
+INDICES = ("obs/0", "obs/1", "obs/2", "obs/3")
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        ({"observation_names": ["a", "b/1", "c d", "e"]}, ("a", "b/1", "c d", "e")),
+        # As gym-anm has them: a quantity, where it is measured, its unit.
+        (
+            {"obs_values": [["bus_p", [0, 1], "MW"], ["aux", [0, 3], None]]},
+            ("bus_p/0", "bus_p/1", "aux/0", "aux/3"),
+        ),
+        # As opfgym has them: a table, its column, its rows.
+        (
+            {"obs_keys": [["load", "p_mw", [4, 7]], ["sgen", "p_mw", ["north", "south"]]]},
+            ("load/p_mw/4", "load/p_mw/7", "sgen/p_mw/north", "sgen/p_mw/south"),
+        ),
+        (
+            {"observation_names": ["a", "b"], "obs_keys": [["load", [1, 2, 3, 4]]]},
+            ("load/1", "load/2", "load/3", "load/4"),
+        ),
+        ({"observation_names": ["a", "b", "c"]}, INDICES),
+        ({"observation_names": ["a", "a", "b", "c"]}, INDICES),
+        ({"observation_names": ["a", "\x1b[31m", "b", "c"]}, INDICES),
+        ({"observation_names": ["a", "1_0", "b", "c"]}, INDICES),
+        ({"observation_names": [1, 2, 3, 4]}, INDICES),
+        ({"observation_names": "abcd"}, INDICES),
+        ({"obs_values": [["p", 3], 7, None, []]}, INDICES),
+    ],
+)
+def test_an_environment_may_name_its_observations(said: dict[str, Any], expected: tuple[str, ...]) -> None:
+    assert describe(of("AcmrOwnNames-v0", kwargs=said)).observation_names == expected
+
+
+def test_an_environment_may_name_its_actions_and_lose_some() -> None:
+    said = {"action_names": ["left", "right"], "observation_names": ["near/a", "near/b", "far/a", "far/b"]}
+    description = describe(of("AcmrOwnNames-v0", kwargs=said, drop_sensors=["near/*"], drop_actuators=["left"]))
+    assert description.observation_names == ("far/a", "far/b")
+    assert description.action_names == ("right",)

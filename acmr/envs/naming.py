@@ -1,7 +1,8 @@
 """Names every observation and every action of an environment.
 
-A name is only given where it is proved: the environment is stepped, and each observation is compared with the MuJoCo
-field that it is named after. What does not agree is named by its index.
+The names that an environment has itself are taken; else a name is only given where it is proved: the environment is
+stepped, and each observation is compared with the MuJoCo field that it is named after. What does not agree is named by
+its index.
 """
 
 from __future__ import annotations
@@ -15,8 +16,13 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from acmr.envs.conversion import ConvertedEnv, is_kept
+from acmr.envs.spaces import own_names
 
 PROBE_STEPS = 10
+
+#: Where environments have names of their own: this project's word for it, gym-anm's, opfgym's.
+_OBSERVATIONS = ("observation_names", "obs_values", "obs_keys")
+_ACTIONS = ("action_names", "act_keys")
 
 _AXES = ("x", "y", "z")
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -124,8 +130,11 @@ def probe(env: ConvertedEnv) -> Probe:
         if _agrees(layout, np.stack(values), seen):
             names = tuple(name for block in layout for name in block.names)
             break
-    actions = tuple(f"action/{row}" for row in range(int(np.prod(action_space.shape))))
-    return Probe(names, part_names(robot.model).actuators if obeyed else actions, tuple(info_keys))
+    count = int(np.prod(action_space.shape))
+    actions = part_names(robot.model).actuators if obeyed else tuple(f"action/{row}" for row in range(count))
+    # What an environment says of itself goes before what was found out.
+    names = own_names(env.env, _OBSERVATIONS, len(names)) or names
+    return Probe(names, own_names(env.env, _ACTIONS, count) or actions, tuple(info_keys))
 
 
 def _layouts(env: Any) -> list[list[_Block]]:

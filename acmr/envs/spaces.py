@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sized
+from collections.abc import Iterator, Mapping, Sequence, Sized
+from itertools import takewhile
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
 from gymnasium.spaces.utils import flatdim, flatten, flatten_space
@@ -35,6 +37,31 @@ def names_of(space: Space[Any]) -> tuple[str, ...]:
         return tuple(names)
     # Names that mean two things, or cannot be shown, are none.
     return tuple(f"obs/{row}" for row in range(len(names)))
+
+
+def own_names(env: gym.Env[Any, Any], attributes: Sequence[str], count: int) -> tuple[str, ...] | None:
+    """The names that an environment has itself for all its observations, or actions, in their order.
+
+    Args:
+        env: The environment, or a wrapper around it; of several that have names the outermost is asked.
+        attributes: Where the names may be. Each holds names, or groups as libraries of power grids have them: words,
+            then the numbers or names of the parts that have such a value, as in ``("load", "p_mw", [0, 1])``.
+        count: How many names are needed.
+
+    Returns:
+        None where there are not as many, or where they are no names: not text, or the same twice.
+    """
+    layer: Any = env
+    while layer is not None:
+        for attribute in attributes:
+            given = vars(layer).get(attribute, getattr(type(layer), attribute, None))
+            if isinstance(given, list | tuple) and given:
+                names = [name for entry in given for name in _own(entry)]
+                usable = all(name.strip() and name.isprintable() and not _is_number(name) for name in names)
+                if len(names) == len(set(names)) == count and usable:
+                    return tuple(names)
+        layer = layer.env if isinstance(layer, gym.Wrapper) else None
+    return None
 
 
 def flat_space(space: Space[Any]) -> Box:
@@ -97,6 +124,29 @@ def _names(space: Space[Any], path: tuple[Any, ...]) -> Iterator[str]:
     # What begins with a digit YAML would take for a number: 1_0 is ten.
     start = f"{called}_" if called[:1].isalpha() else f"obs/{called}_" if path else "obs/"
     yield from (f"{start}{row}" for row in range(flatdim(space)))
+
+
+def _own(entry: object) -> list[str]:
+    """The names that one entry of an environment's own list stands for; an empty one for what is none."""
+    if isinstance(entry, str):
+        return [entry]
+    if not isinstance(entry, list | tuple):
+        return [""]
+    words = list(takewhile(lambda part: isinstance(part, str), entry))
+    parts = entry[len(words)] if len(words) < len(entry) else []
+    try:
+        return ["/".join([*words, str(part)]) for part in parts]
+    except TypeError:
+        return [""]
+
+
+def _is_number(name: str) -> bool:
+    """Whether a command line would take a name for an index."""
+    try:
+        int(name)
+    except ValueError:
+        return False
+    return True
 
 
 def _values(given: Any, space: Space[Any], title: str) -> Iterator[np.ndarray]:
