@@ -28,6 +28,7 @@ from acmr.records import (
     TENSOR_FILE,
     DamagedError,
 )
+from acmr.text import message
 
 #: Most bytes of settings, summaries and notices; of descriptions; of tables, unpacked; of networks.
 SETTINGS, DESCRIPTIONS, TABLES, NETWORKS = 1 << 20, 4 << 20, 1 << 28, 1 << 30
@@ -162,10 +163,11 @@ def parse_mapping(name: str, data: bytes, title: str = "") -> dict[str, Any]:
     """
     title = title or name
     try:
-        text = data.decode("utf-8")
-        value = json.loads(text) if name.endswith(".json") else _yaml(title, text)
-    except (ValueError, yaml.YAMLError, RecursionError, OverflowError):
-        raise DamagedError(f"{title}: cannot be read") from None
+        # Some editors begin a file with a mark of its encoding.
+        text = data.decode("utf-8-sig")
+        value = json.loads(text, object_pairs_hook=_object) if name.endswith(".json") else _yaml(title, text)
+    except (ValueError, yaml.YAMLError, RecursionError, OverflowError) as error:
+        raise DamagedError(f"{title}: cannot be read ({_reason(error)})") from None
     if not isinstance(value, dict):
         raise DamagedError(f"{title}: holds no settings")
     _check(title, value)
@@ -206,7 +208,47 @@ def _yaml(title: str, text: str) -> Any:
             raise ValueError("aliases")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         _check_depth(title, depth)
-    return yaml.load(text, _LOADER)
+    loader = _LOADER(text)
+    try:
+        node = loader.get_single_node()
+        _check_keys(node)
+        return None if node is None else loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+def _check_keys(node: yaml.Node | None) -> None:
+    """Refuses two values of one key: which of them a reader takes is its own affair."""
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key, value in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    raise ValueError(f"line {key.start_mark.line + 1}: {key.value} is there twice")
+                seen.add(key.value)
+            _check_keys(value)
+    elif isinstance(node, yaml.SequenceNode):
+        for entry in node.value:
+            _check_keys(entry)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object, in which each key has one value."""
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"{key} is there twice")
+        found[key] = value
+    return found
+
+
+def _reason(error: Exception) -> str:
+    """Why, and where, in a few visible words."""
+    if isinstance(error, UnicodeDecodeError):
+        return f"not UTF-8 at byte {error.start}"
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        return f"line {error.problem_mark.line + 1}: {message(ValueError(error.problem))}"
+    return message(error)
 
 
 def _check_depth(title: str, depth: int) -> None:

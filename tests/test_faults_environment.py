@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -21,8 +17,6 @@ from acmr.envs import make_env
 from acmr.evaluation.cli import main as evaluate
 from acmr.settings.compose import environment_config
 from sweeps.status import main as status
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 class Simulator:
@@ -214,40 +208,3 @@ def test_what_fails_in_the_trial_leaves_no_directory(tmp_path: Any) -> None:
         Run(tmp_path / "runs", words)()
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "runs").glob("*/"))
-
-
-#: An environment that begins what never ends; a pool's threads wait for work until they are told to go.
-RESTLESS = """
-import os, threading, time
-from concurrent.futures import ThreadPoolExecutor
-import gymnasium as gym
-from gymnasium.envs.classic_control.pendulum import PendulumEnv
-class Restless(PendulumEnv):
-    def __init__(self, **more):
-        super().__init__(**more)
-        if os.environ["KIND"] == "pool":
-            self.pool = ThreadPoolExecutor(1)
-            self.pool.submit(len, "")
-        else:
-            threading.Thread(target=time.sleep, args=[1e6], name="viewer").start()
-    def step(self, action):
-        if os.environ["KIND"] == "failing":
-            raise ValueError("the simulator is gone")
-        return super().step(action)
-gym.register("Restless-v0", Restless, max_episode_steps=50)
-"""
-
-
-@pytest.mark.parametrize(("kind", "code"), [("sleep", 0), ("failing", 2), ("pool", 0)])
-@pytest.mark.first_is_fast
-def test_a_thread_of_an_environment_s_keeps_no_process(kind: str, code: int, tmp_path: Path) -> None:
-    (tmp_path / "restless.py").write_text(RESTLESS)
-    words = "env=gym env.id=restless:Restless-v0 total_timesteps=120 agent.hidden_sizes=[8] agent.batch_size=8 "
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "run.py"), *words.split(), "agent.learning_starts=50", "tracking=off"],
-        cwd=tmp_path, env={**os.environ, "KIND": kind, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == code, done.stderr
-    assert ("a thread that is not this program's does not end (viewer" in done.stderr) == (kind != "pool")
-    assert len(list(tmp_path.glob("runs/*/*/seed_1/summary.json"))) == (code == 0)

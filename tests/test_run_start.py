@@ -93,6 +93,8 @@ def test_in_a_notebook(tmp_path: Path) -> None:
             ["hydra.searchpath=[s3://bucket/conf]"],
             "hydra.searchpath: s3://bucket/conf: a folder or a package is needed",
         ),
+        ([f"agent.hidden_sizes=[{'8,' * 20_000}8]"], "agent.hidden_sizes: 40,022 characters, at most 16,384 are taken"),
+        ([f"agent.hidden_sizes=[{'8,' * 100}8]"], "agent.hidden_sizes: 101 widths, at most 100 are taken"),
         (["consecutive=2147483649"], "consecutive=2147483649: an integer of at most 2147483648 is needed"),
         (["threshold=1e101"], "a finite return is needed, of at most 1e+100 in size"),
         (["-m", "output_dir=s3://bucket/runs"], "is an address; type a folder of this machine"),

@@ -41,7 +41,9 @@ def find_spec(env_id: str) -> EnvSpec:
     if module:
         try:
             importlib.import_module(module)
-        except (Exception, SystemExit) as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
             raise ConfigError(f"env.id={env_id}: cannot import {module}: {one_line(error)}") from error
     spec = gym.registry.get(name)
     if spec is None or _is_stub(spec):
@@ -88,7 +90,9 @@ def construct(config: EnvConfig, render_mode: str | None = None) -> ConvertedEnv
             env = gym.make(spec, max_episode_steps=config.max_episode_steps, disable_env_checker=True, **kwargs)
         except ConfigError:
             raise
-        except (Exception, SystemExit) as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
             raise ConfigError(_reason(config, creator, error)) from error
     _check_spaces(config.id, env)
     return ConvertedEnv(env, config.id)
@@ -133,7 +137,9 @@ def _creator(spec: EnvSpec) -> Any:
         return spec.entry_point
     try:
         return load_env_creator(spec.entry_point)
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         raise ConfigError(f"env.id={spec.id}: {one_line(error)}") from error
 
 

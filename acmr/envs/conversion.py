@@ -79,7 +79,9 @@ class ConvertedEnv(gym.Wrapper[np.ndarray, np.ndarray, Any, Any]):
         """
         try:
             observation, info = self.env.reset(seed=seed, options=options)
-        except (Exception, SystemExit) as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
             raise self._raised("reset", error) from error
         return self._observation(observation), self._info(info)
 
@@ -101,7 +103,9 @@ class ConvertedEnv(gym.Wrapper[np.ndarray, np.ndarray, Any, Any]):
         np.minimum(command, self._high, out=command)
         try:
             observation, reward, terminated, truncated, info = self.env.step(command)
-        except (Exception, SystemExit) as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
             raise self._raised("step", error) from error
         return (
             self._observation(observation),

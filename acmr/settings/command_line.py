@@ -31,6 +31,8 @@ RENAME = "transfer.rename"
 _CALL = re.compile(r"\$\{[^}]*:")
 #: A variable as a shell writes it, or as OmegaConf once did.
 _SHELLS = re.compile(r"\$\{(?:env:)?([A-Za-z_]\w*)[^}.]*\}")
+#: Characters of one argument: Hydra's parser takes a minute over more, and time that grows faster than their number.
+LONGEST_ARGUMENT = 16_384
 #: What may be asked of a shell's completion.
 _COMPLETION = ("install", "uninstall", "query")
 #: What Hydra reads as another thing than a name.
@@ -47,6 +49,9 @@ def hydra_arguments(given: Sequence[str]) -> list[str]:
         # Here, for whatever is wrong with it would be said with it.
         if holds_userinfo(argument):
             raise ConfigError(f"{without_userinfo(argument.partition('=')[0])}: {NO_USERINFO}")
+        if len(argument) > LONGEST_ARGUMENT:
+            key = argument.partition("=")[0][:60]
+            raise ConfigError(f"{key}: {len(argument):,} characters, at most {LONGEST_ARGUMENT:,} are taken")
     chosen = _check_options(given)
     searched = [place for argument in given if _is_search_path(argument) for place in _searched(argument)]
     folder = [f"file://{Path(chosen.config_dir).absolute()}"] if chosen.config_dir else []

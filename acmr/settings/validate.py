@@ -38,6 +38,8 @@ NO_USERINFO = (
 )
 #: No machine has more.
 MOST_THREADS = 4096
+#: Hidden layers; nobody learns with more.
+MOST_LAYERS = 100
 
 
 def validate(config: ExperimentConfig) -> None:
@@ -81,6 +83,8 @@ def validate(config: ExperimentConfig) -> None:
             f"agent.hidden_sizes={agent.hidden_sizes}: one or more widths of at least 1 are needed, "
             "as in agent.hidden_sizes=[256,256]"
         )
+    if len(agent.hidden_sizes) > MOST_LAYERS:
+        raise ConfigError(f"agent.hidden_sizes: {len(agent.hidden_sizes):,} widths, at most {MOST_LAYERS} are taken")
     if max(agent.hidden_sizes) > MOST_SEED:
         raise ConfigError(f"agent.hidden_sizes={agent.hidden_sizes}: integers of at most {MOST_SEED} are needed")
     _one_of("agent.precision", agent.precision, PRECISIONS)
