@@ -56,7 +56,10 @@ class Criterion:
 #: The counts, and the smoothed returns; 50 episodes are the paper's rolling average.
 CRITERIA = (*map(Criterion, (1, 3, 5, 10)), *(Criterion(episodes, smoothed=True) for episodes in (5, 10, 50)))
 #: What has to be known of a run to judge it.
-_JUDGED = (*("group", "cell", "seed", "state", "reason", "counted", "cut", "horizon", "stop_after", "total_timesteps"),)
+_JUDGED = (
+    *("group", "cell", "seed", "state", "reason", "counted", "cut", "apart"),
+    *("horizon", "stop_after", "total_timesteps"),
+)
 #: Steps of the thresholds' grid below and above the one that is asked for: 4500 to 5200 for 4900.
 _BELOW, _ABOVE, _WIDTH = 4, 3, 0.02
 
