@@ -29,7 +29,7 @@ $(READY): pyproject.toml constraints.txt
 	@touch $@
 
 test: $(READY) ## all tests but the slow ones, in at most 5 minutes on 2 cores
-	python -m pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
+	python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" $(ARGS)
 
 test-slow: $(READY) ## the tests that take minutes: kills, whole sweeps, Slurm
 	python -m pytest -n 2 --dist loadfile -m slow $(ARGS)

@@ -202,6 +202,7 @@ def test_older_runs_whose_files_contradict_each_other_are_damaged(old, new, said
     ],
 )
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_of_changed_metrics_no_speed_is_shown(change, root):
     seal(run_directory(root, "A2", 2))
     data = analyze(load(root)).measured

@@ -63,6 +63,7 @@ def test_a_cell_of_which_the_fast_runs_have_ended_is_biased(root, others, said):
     assert row["note"].endswith(f"Type {command}")
 
 
+@pytest.mark.slow
 def test_runs_past_the_slowest_that_ended_count_as_not_reached_yet(root):
     ended(root, 1, 6000)
     ended(root, 2, 6300)

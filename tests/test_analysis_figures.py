@@ -185,6 +185,7 @@ def test_axes_of_returns_begin_at_zero_and_means_have_intervals(tmp_path, sign):
     plt.close(figure)
 
 
+@pytest.mark.slow
 def test_the_wall_clock_of_stopped_and_full_runs_is_not_averaged(tmp_path):
     for seed in (1, 2, 3):
         write_run(tmp_path, "A0", seed, rows_reaching(8000, TOTAL), total=TOTAL)

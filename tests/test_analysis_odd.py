@@ -70,6 +70,7 @@ def check(
 
 @pytest.mark.parametrize("key", SUMMARY)
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_a_number_out_of_range_in_a_summary_is_listed(root, capsys, key):
     value, reason = SUMMARY[key]
     write_run(root, "A0", 3, ROWS, total=20_000, summary={key: value})
@@ -78,6 +79,7 @@ def test_a_number_out_of_range_in_a_summary_is_listed(root, capsys, key):
 
 @pytest.mark.parametrize("key", CONFIG)
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_a_number_out_of_range_in_settings_is_listed(root, capsys, key):
     value, reason = CONFIG[key]
     write_odd(root, "A0", 3, {key: value})
@@ -102,6 +104,7 @@ def nested(depth: int) -> dict:
 @pytest.mark.parametrize("depth", [40, 200, 900, 100_000])
 @pytest.mark.parametrize("name", ["summary.json", "config.yaml"])
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_settings_within_settings_are_listed(root, capsys, depth, name):
     folder = write_run(root, "A0", 3, ROWS, total=20_000)
     (folder / name).write_text('{"a": ' * depth + "1" + "}" * depth)

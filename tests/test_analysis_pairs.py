@@ -78,6 +78,7 @@ def test_equal_first_episodes_are_counted(tmp_path):
     assert table.loc[("A0", "A3"), "shared_episodes"] == 0
 
 
+@pytest.mark.slow
 def test_runs_without_a_partner_are_left_out_and_counted(tmp_path):
     write_matrix(tmp_path, {"A0": TIMES["A0"], "A2": TIMES["A2"][:2]}, total=TOTAL, length=100)
     row = paired_of(tmp_path).loc[("A0", "A2")]
@@ -86,6 +87,7 @@ def test_runs_without_a_partner_are_left_out_and_counted(tmp_path):
     assert math.isnan(row["correlation"])
 
 
+@pytest.mark.slow
 def test_one_pair_has_no_test(tmp_path):
     write_matrix(tmp_path, {"A0": (8000,), "A2": (7000,)}, total=TOTAL, length=100)
     row = paired_of(tmp_path).loc[("A0", "A2")]
@@ -130,6 +132,7 @@ def test_runs_that_stopped_before_another_threshold_tell_their_order_only(tmp_pa
     assert paired_of(tmp_path).loc[("A0", "A2"), "difference"] == pytest.approx((6000 + 7000 + 8000 - 24_500) / 3)
 
 
+@pytest.mark.slow
 def test_a_biased_cell_is_not_tested(tmp_path):
     write_matrix(tmp_path, {"A0": (8000, 9000, 8500)}, total=TOTAL, length=100)
     write_cut(tmp_path, "A2", 1, rows_reaching(5000, TOTAL), TOTAL)

@@ -189,6 +189,7 @@ def test_a_run_that_never_got_there_gives_restricted_means(tmp_path):
     assert np.isnan(nobody["difference"])
 
 
+@pytest.mark.slow
 def test_the_table_to_be_read_tells_the_same(tmp_path):
     write_study(tmp_path, ("A2",))
     found = analyze(load(tmp_path)).study

@@ -74,6 +74,7 @@ def test_the_limit_of_a_wrapper_of_one_s_own_counts() -> None:
     assert [*limits.values()] == [None, 20, 50, 30, 20, 30, 10_000, 20, 50]
 
 
+@pytest.mark.slow
 def test_an_evaluation_cuts_endless_episodes_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -93,6 +93,7 @@ gym.register("Restless-v0", Restless, max_episode_steps=50)
 
 @pytest.mark.parametrize(("kind", "code"), [("sleep", 0), ("failing", 2), ("pool", 0)])
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_a_thread_of_an_environment_s_keeps_no_process(kind: str, code: int, tmp_path: Path) -> None:
     (tmp_path / "restless.py").write_text(RESTLESS)
     words = "env=gym env.id=restless:Restless-v0 total_timesteps=120 agent.hidden_sizes=[8] agent.batch_size=8 "

@@ -59,6 +59,7 @@ def test_help_says_what_settings_mean_and_lists_sweeps(tmp_path):
     assert "    Learning rate of the critics and of the temperature (Adam).\n" in done.stdout
 
 
+@pytest.mark.slow
 def test_every_command_finds_the_user_s_folder(own):
     done = run(own, "-m", "acmr.envs", "swing", "--config-dir", "own")
     assert "3 observations, 1 actions, 50 steps an episode" in done.stdout, done.stderr

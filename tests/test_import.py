@@ -73,6 +73,7 @@ def test_cleanrl(as_mapping, tmp_path, capsys):
         torch.testing.assert_close(ours(seen, actions), layer(theirs, "fc3", value)[:, 0])
 
 
+@pytest.mark.slow
 def test_an_imported_teacher_teaches_is_evaluated_and_exported(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_sb3_model(tmp_path / "model.zip")

@@ -136,6 +136,7 @@ def test_an_evaluation_that_a_run_has_is_taken_if_it_is_the_one_that_is_wanted(r
     assert (result(done.added[0]) == result(published(runs, "A1"))) == taken
 
 
+@pytest.mark.slow
 def test_networks_are_added_to_a_run_that_was_published_without(runs, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(published(runs, "A0"), published(out, "A0"))

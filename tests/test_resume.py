@@ -75,6 +75,7 @@ def test_an_environment_that_is_stored_between_episodes_says_so_once(tmp_path):
 
 @pytest.mark.parametrize("transfer", ["hidden", "expand"])
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_a_student_with_frozen_layers(transfer, untouched, tmp_path):
     teacher = untouched(ANT)[1]
     overrides = (

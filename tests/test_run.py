@@ -104,6 +104,7 @@ def test_same_seed_same_bytes_and_another_seed_other_ones(seven, tmp_path):
     assert (other / "teacher.safetensors").read_bytes() != (folder / "teacher.safetensors").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_complete_run_is_left_alone_and_force_repeats_it(seven):
     folder = folders(seven)["A0"]
     before = (folder / "summary.json").stat().st_mtime_ns
@@ -144,7 +145,7 @@ def test_a_teacher_by_path(seven, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["sed=1"], "did you mean seed?"),
+        (["sed=1"], "did you mean seed or seeding?"),
         (["transfer=hiden"], "did you mean transfer=hidden?"),
         (["transfer=none", "freeze=true"], "type freeze=false, or type transfer=hidden"),
         (["transfer=direct"], "the source environment ant has 27 sensors and 8 actuators, the student 23 sens"),

@@ -122,6 +122,7 @@ def test_runs_of_one_seed_share_their_first_episodes_or_none(seeding, tmp_path):
     assert all(shared) if seeding == "paired" else not any(shared)
 
 
+@pytest.mark.slow
 def test_one_that_stops_is_still_the_beginning_of_the_full_one(tmp_path):
     common = (*ANT, INDEPENDENT, "threshold=1e9")
     full, left = (

@@ -85,6 +85,7 @@ def test_a_film_runs_at_the_robots_pace_and_shows_it_move(
 
 
 @needs_gl
+@pytest.mark.slow
 def test_a_film_of_some_seconds_goes_on_over_the_episodes(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
