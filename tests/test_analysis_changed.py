@@ -81,6 +81,7 @@ def test_every_changed_digit_of_the_episodes_is_told(root):
 
 @pytest.mark.parametrize("column", [0, 2])
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_of_older_runs_steps_and_lengths_that_do_not_agree_are_told(column, root, capsys):
     def change(folder: Path) -> None:
         lines = (folder / "episodes.csv").read_text().splitlines()
@@ -185,6 +186,7 @@ def test_settings_that_were_changed_are_not_used(name, old, new, root):
     ],
 )
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_older_runs_whose_files_contradict_each_other_are_damaged(old, new, said, root, capsys):
     _, after = changed(root, replaced("summary.json", old, new), sealed=False)
     assert (after["state"], after["counted"], after["cell"], after["seed"]) == ("damaged", False, "A2", 2)

@@ -155,6 +155,7 @@ def test_captions_name_what_is_drawn(folders):
     assert SPECS["return_profiles"].said(few).endswith("Drawn: H0 (1 full run), A0 (2 full runs), A2 (1 full run).")
 
 
+@pytest.mark.slow
 def test_a_difference_of_a_single_run_is_not_drawn_like_a_tested_one(tmp_path):
     write_matrix(tmp_path, {"A0": (8000, 8500), "A1": (7000, 7900), "A2": (6000,)}, total=TOTAL, length=100)
     figure = SPECS["differences"].draw(drawing(tmp_path), PALETTES[0])

@@ -122,6 +122,7 @@ def test_a_number_that_cannot_be_printed_is_listed(root, capsys, number):
 
 @pytest.mark.parametrize("name", [f"seed_{SEED}", "seed_99999999999999999999"])
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_a_folder_with_a_seed_out_of_range_is_listed(root, capsys, name):
     (root / "A0" / name).mkdir(parents=True)
     (root / "A0" / name / "episodes.csv").write_text("global_step,episodic_return,episode_length\n10,1.0,10\n")
@@ -163,6 +164,7 @@ def test_a_report_is_made_of_any_of_them(root, tmp_path, capsys):
 
 @pytest.mark.parametrize("value", [1e308, -1e200, math.inf])
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_absurd_returns_meet_no_threshold_and_spoil_no_number(root, capsys, value):
     rows = ROWS.copy()
     rows[::2, 1] = value

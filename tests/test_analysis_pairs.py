@@ -106,6 +106,7 @@ def test_one_pair_has_no_test(tmp_path):
     ],
 )
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_runs_that_never_got_there_keep_their_order_and_give_restricted_means(tmp_path, first, second, expected):
     write_matrix(tmp_path, {"A0": first, "A2": second}, total=TOTAL, length=100)
     row = paired_of(tmp_path).loc[("A0", "A2")]

@@ -135,6 +135,7 @@ def test_each_difference_is_that_of_an_analysis_with_this_threshold(full, limit,
 
 @pytest.mark.parametrize("cut", [("A2",), ("A0", "A2"), ("A0", "A2", "H0")])
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_runs_that_stopped_say_what_the_full_ones_say_or_nothing(tmp_path, full, cut):
     write_study(tmp_path, cut)
     points = points_of(tmp_path)
@@ -176,6 +177,7 @@ def test_a_cell_of_which_the_fast_runs_have_ended_has_no_difference(tmp_path):
     assert "A2 − A0, all runs (1 + 3): not known at any of 56 settings" in sensitivity_lines(study.overview)
 
 
+@pytest.mark.slow
 def test_a_run_that_never_got_there_gives_restricted_means(tmp_path):
     for seed, (slow_one, fast_one) in enumerate(((9000, 6000), (None, 7000), (11_000, 5000)), start=1):
         write_run(tmp_path, "A0", seed, rows_reaching(slow_one, TOTAL), total=TOTAL)

@@ -25,6 +25,7 @@ def error_of(said: str) -> str:
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EDQUOT])
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_a_disk_that_takes_no_checkpoint(code, tmp_path, untouched):
     run = Run(tmp_path, ANT)
     count = tmp_path / "writes"

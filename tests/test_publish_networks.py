@@ -20,6 +20,8 @@ from acmr.transfer.teacher import load_teacher, save_halved
 from analysis import publish as publishing
 from analysis.publish import Published, PublishError, publish
 
+pytestmark = pytest.mark.slow
+
 SMALL, WIDE = 32, 300
 
 
@@ -104,7 +106,6 @@ def test_each_policy_is_evaluated_as_it_is_published(done):
     assert not (published(out, "A3") / "evaluation.json").exists()
 
 
-@pytest.mark.slow
 def test_what_is_there_is_neither_made_again_nor_touched(runs, tmp_path):
     out, said = tmp_path / "results" / "quick", []
     publish(runs, out)
@@ -136,7 +137,6 @@ def test_an_evaluation_that_a_run_has_is_taken_if_it_is_the_one_that_is_wanted(r
     assert (result(done.added[0]) == result(published(runs, "A1"))) == taken
 
 
-@pytest.mark.slow
 def test_networks_are_added_to_a_run_that_was_published_without(runs, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(published(runs, "A0"), published(out, "A0"))
@@ -147,7 +147,6 @@ def test_networks_are_added_to_a_run_that_was_published_without(runs, tmp_path):
     assert precision_of(published(out, "A0")) == "float16"
 
 
-@pytest.mark.slow
 def test_other_networks_of_a_run_are_not_overwritten(runs, tmp_path):
     out, own = tmp_path / "out", published(runs, "A0").parent
     publish(own, published(out, "A0").parent)
@@ -158,7 +157,6 @@ def test_other_networks_of_a_run_are_not_overwritten(runs, tmp_path):
     assert (published(out, "A0") / "teacher.json").read_bytes() == before
 
 
-@pytest.mark.slow
 def test_what_would_be_too_large_for_a_clone_is_refused_before_anything_is_written(runs, tmp_path, monkeypatch, capsys):
     out = tmp_path / "results" / "quick"
     other = tmp_path / "results" / "paper" / "x" / "seed_1"
@@ -177,7 +175,6 @@ def test_what_would_be_too_large_for_a_clone_is_refused_before_anything_is_writt
     assert len(publish(published(runs, "A1").parent, out).added) == 1
 
 
-@pytest.mark.slow
 def test_networks_that_cannot_be_evaluated_are_named_and_the_rest_is_published(runs, tmp_path, capsys, monkeypatch):
     path = published(runs, "A1") / "teacher.safetensors"
     path.write_bytes(path.read_bytes()[:-1] + b"x")

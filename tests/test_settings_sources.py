@@ -80,6 +80,7 @@ def test_a_sweep_finds_them_and_plans_their_teachers(way: str, own: Path) -> Non
 
 @pytest.mark.parametrize("way", [WAYS[0], WAYS[3]])
 @pytest.mark.first_is_fast
+@pytest.mark.slow
 def test_a_single_run_finds_them_and_prints_a_command_that_does(way: str, own: Path) -> None:
     done = run(own.parent, *shlex.split(way.format(own=own)), *SINGLE)
     assert done.returncode == 2

@@ -50,6 +50,7 @@ def same_scalars(folder: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_killed_run_loses_no_event_and_a_resumed_one_has_none_twice(tmp_path: Path) -> None:
     run = Run(tmp_path, TENSORBOARD)
     assert run(at_step(245)).code == -signal.SIGKILL
