@@ -34,8 +34,8 @@ test: $(READY) ## all tests but the slow ones, in at most 5 minutes on 2 cores
 test-slow: $(READY) ## the tests that take minutes: kills, whole sweeps, Slurm
 	python -m pytest -n 2 --dist loadfile -m slow $(ARGS)
 
-torture: $(READY) ## five times as many kills, signals and damaged files: half an hour
-	ACMR_TORTURE=5 python -m pytest -n 2 --dist loadfile -m slow $(ARGS) \
+torture: $(READY) ## five times as many kills, signals and damaged files: five minutes
+	ACMR_TORTURE=5 python -m pytest -n 2 --dist worksteal -m slow $(ARGS) \
 		tests/test_resume_kills.py tests/test_resume_writes.py tests/test_resume_damage.py
 
 mutations: $(READY) ## 5,000 changes of files of runs under the analysis: half an hour
