@@ -30,10 +30,15 @@ def overview() -> Iterator[str]:
         config = environment_config(name)
         if config.name != name and config == environment_config(config.name):
             yield f"{name:<22} {'':>4} {'':>4} {'':>6}  = {config.name}"
-        else:
+            continue
+        try:
             about = describe(config)
-            sizes = f"{len(about.observation_names):>4} {len(about.action_names):>4}"
-            yield f"{name:<22} {sizes} {about.max_episode_steps or '-':>6}  {_what(config)}"
+        except ConfigError as error:
+            # One that cannot be made here, for want of a package for instance, leaves the others listed.
+            yield f"{name:<22} {'-':>4} {'-':>4} {'-':>6}  {error}"
+            continue
+        sizes = f"{len(about.observation_names):>4} {len(about.action_names):>4}"
+        yield f"{name:<22} {sizes} {about.max_episode_steps or '-':>6}  {_what(config)}"
 
 
 def details(name: str) -> Iterator[str]:
