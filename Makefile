@@ -32,7 +32,7 @@ test: $(READY) ## all tests but the slow ones, in at most 5 minutes on 2 cores
 	python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" $(ARGS)
 
 test-slow: $(READY) ## the tests that take minutes: kills, whole sweeps, Slurm
-	python -m pytest -n 2 --dist loadfile -m slow $(ARGS)
+	python -m pytest -n 2 --dist worksteal -m slow $(ARGS)
 
 torture: $(READY) ## five times as many kills, signals and damaged files: five minutes
 	ACMR_TORTURE=5 python -m pytest -n 2 --dist worksteal -m slow $(ARGS) \

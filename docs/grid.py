@@ -87,7 +87,7 @@ def _policies() -> str:
         for policy in ("nothing", "random"):
             days = played[grid, policy]
             rows.append([grid, {"nothing": "do nothing", "random": "at random"}[policy], *_earned(days)])
-        for seed, days in _evaluated(cell):
+        for seed, days in evaluated(cell):
             rows.append([grid, f"{cell}, seed {seed}, learned", *_earned(days)])
     return table(["grid", "policy", "mean return of 20 days", "days without a blackout"], rows)
 
@@ -96,11 +96,11 @@ def _earned(days: list[tuple[float, int]]) -> list[str]:
     return [number(mean(earned for earned, _ in days), 1), f"{sum(length == DAY for _, length in days)} of {len(days)}"]
 
 
-def _evaluated(cell: str) -> Iterable[tuple[int, list[tuple[float, int]]]]:
+def evaluated(cell: str) -> Iterable[tuple[int, list[tuple[float, int]]]]:
     """The evaluations of a cell's published runs, by seed."""
     for seed, folder in _runs()[cell]:
         found = json.loads((folder / EVALUATION_FILE).read_text(encoding="utf-8"))
-        yield seed, [(episode["return"], episode["length"]) for episode in found["episodes"]]
+        yield seed, [(episode["episodic_return"], episode["episode_length"]) for episode in found["each"]]
 
 
 def _cells() -> str:

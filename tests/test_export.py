@@ -28,7 +28,7 @@ def needs(*modules: str) -> None:
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
         assert not os.environ.get("ACMR_REQUIRE_EXTRAS"), f"{missing} are to be installed here"
-        pytest.skip(f"{', '.join(missing)} not installed; type pip install '.[onnx,sb3,tune]'")
+        pytest.skip(f"{', '.join(missing)} not installed; type pip install '.[onnx,sb3,tune,grid]'")
 
 
 @pytest.fixture(params=CORES, ids=["plain", "adapters"])

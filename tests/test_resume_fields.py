@@ -53,7 +53,8 @@ def put(values: dict[str, Any], path: str, fresh: dict[str, Any]) -> None:
 def base(request, tmp_path_factory) -> tuple[Run, dict[int, dict[str, bytes]], Snapshot]:
     """A run killed at step 130, what it comes to from each of its checkpoints, and the state of a fresh one."""
     overrides = {"ant": ANT, "humanoid": HUMANOID, "plain": (*ANT, "agent=sac_plain")}[request.param]
-    overrides = (*overrides, "total_timesteps=210")
+    # The plain learner has three times as many entries and takes three times as long for a step.
+    overrides = (*overrides, "total_timesteps=150" if request.param == "plain" else "total_timesteps=210")
     folder = tmp_path_factory.mktemp(request.param)
     run = Run(folder / "base", overrides)
     for step in STEPS:
@@ -117,6 +118,9 @@ def test_each_entry_matters(base):
     names = [*snapshot.arrays, PHYSICS, *leaves(snapshot.values)]
     names = [name for name in names if not name.startswith(ELSEWHERE) or name == PHYSICS]
     names = [name for name in names if not name.startswith("fingerprint/")]
+    if "agent=sac_plain" in run.overrides:
+        # All else is the same code as with the other learner.
+        names = [name for name in names if name.startswith(("torch/agent/", "state/agent/"))]
     assert len(names) > 40
     without_effect = [
         name for name in names if all(outcome(folder, step, run.overrides, name, fresh) == made[step] for step in STEPS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -37,6 +38,9 @@ def cluster() -> Iterator[Callable[..., str]]:
         unavailable(f"{', '.join(missing)} not installed (apt-get install slurmctld slurmd slurm-client munge ...)")
     if os.getuid() != 0:
         unavailable("a cluster can only be started by root")
+    # There is one cluster at a time: tests of this file may run in several processes.
+    turn = open(Path(tempfile.gettempdir()) / "acmr-slurm.lock", "w")  # noqa: SIM115 (held until the end)
+    fcntl.flock(turn, fcntl.LOCK_EX)
     # Munge's own user has to reach it, which a folder of pytest's forbids.
     folder = Path(tempfile.mkdtemp(prefix="acmr-slurm-"))
     started = subprocess.run(["sh", SCRIPT, "start", folder], capture_output=True, text=True, timeout=60)
@@ -49,6 +53,7 @@ def cluster() -> Iterator[Callable[..., str]]:
         subprocess.run(["sh", SCRIPT, "stop", folder], capture_output=True, timeout=60, check=False)
         del os.environ["SLURM_CONF"]
         shutil.rmtree(folder, ignore_errors=True)
+        turn.close()
 
 
 def start(out: Path, *words: str) -> subprocess.Popen[str]:

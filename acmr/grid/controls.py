@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-#: Steps of ramping that a generator may be ordered away from its schedule: half an hour.
-_RAMPS = 6
+#: Steps of ramping that a generator may be ordered away from its schedule: a quarter of an hour.
+_RAMPS = 3
 
 
 @dataclass(frozen=True)

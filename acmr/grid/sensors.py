@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 _DAY = 24 * 60
+#: Of a line, as a share of its limit: what goes on below is of less interest than the same difference above.
+_LOADED = 0.8
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,9 @@ class Sensors:
 def sensors(grid: Any, gone: Sequence[str]) -> Sensors:
     """The measurements that a grid without some components has.
 
-    Each is divided by a constant of the grid: power by the generator's, the storage unit's or, for a load, by a mean
-    load's share of all rated power; a line's current by its thermal limit; energy by the unit's capacity.
+    Each is scaled by a constant of the grid: power is divided by the generator's, the storage unit's or, for a load, by
+    a mean load's share of all rated power, energy by the unit's capacity; a line's current is 0 at 80% of its thermal
+    limit and 1 at the limit.
 
     Args:
         grid: A grid2op environment.
@@ -55,7 +58,7 @@ def sensors(grid: Any, gone: Sequence[str]) -> Sensors:
         ("curtailment_limit", grid.name_gen, renewable, lambda seen: seen.curtailment_limit),
         ("load_p", grid.name_load, loads, lambda seen: seen.load_p / load),
         ("load_q", grid.name_load, loads, lambda seen: seen.load_q / load),
-        ("rho", grid.name_line, lines, lambda seen: seen.rho),
+        ("rho", grid.name_line, lines, lambda seen: (seen.rho - _LOADED) / (1 - _LOADED)),
         ("timestep_overflow", grid.name_line, lines, lambda seen: seen.timestep_overflow / overload),
         ("line_status", grid.name_line, lines, lambda seen: seen.line_status),
         ("storage_charge", grid.name_storage, stored, lambda seen: seen.storage_charge / grid.storage_Emax),
