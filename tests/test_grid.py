@@ -9,7 +9,6 @@ from guides import copy_checkout, follow
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy import stats
 from test_export import needs
 from torture import Run, at_step, same
 
@@ -188,18 +187,16 @@ def test_the_guide_works(tmp_path):
     said = follow(grid.PAGE, copy_checkout(tmp_path / "copy"))
     assert "redispatch/gen_1_0  [-15, 15]" in said
     # Without its hydro plant: seven commands, the storage units' among them.
-    assert said.count("action") == 5 + 7
+    assert sum(line.startswith("action ") for line in said.splitlines()) == 8 + 5 + 7
     assert "storage/storage_5_0" in said
 
 
-@pytest.mark.parametrize("policy", ["nothing", "random"])
-def test_the_published_teachers_do_better_than_who_learned_nothing(policy):
+def test_the_published_teachers_do_better_than_who_learned_nothing():
+    untaught: dict[str, list[float]] = {"nothing": [], "random": []}
     with grid.UNTAUGHT.open() as file:
-        rows = [row for row in csv.DictReader(file) if row["grid"] == "grid14" and row["policy"] == policy]
-    untaught = [float(row["return"]) for row in rows]
-    taught = {}
-    for seed, days in grid.evaluated("H0"):
-        taught[seed] = [earned for earned, _ in days]
-        # The same twenty days.
-        assert stats.wilcoxon(taught[seed], untaught, alternative="greater").pvalue < 0.01, seed
+        for row in csv.DictReader(file):
+            if row["grid"] == "grid14":
+                untaught[row["policy"]].append(float(row["return"]))
+    taught = {seed: np.mean([earned for earned, _ in days]) for seed, days in grid.evaluated("H0")}
     assert len(taught) == 5
+    assert min(taught.values()) > max(map(np.mean, untaught.values()))
