@@ -33,7 +33,7 @@ def of(env_id: str, **settings: Any) -> EnvConfig:
     return EnvConfig(name=env_id, id=env_id, source=env_id, **settings)
 
 
-EVERYWHERE = [environment_config(name) for name in options("env") if name != "gym"] + [
+EVERYWHERE = [environment_config(name) for name in options("env") if name != "gym" and not name.startswith("grid")] + [
     of(env_id) for env_id in GYMNASIUM
 ]
 EVERYWHERE += [
