@@ -83,12 +83,13 @@ def _policies() -> str:
         for row in csv.DictReader(file):
             played[row["grid"], row["policy"]].append((float(row["return"]), int(row["steps"])))
     rows = []
-    for grid, cell in zip(GRIDS, ("H0", "A0"), strict=True):
+    for grid, cells in zip(GRIDS, (("H0",), ("A0", "N1")), strict=True):
         for policy in ("nothing", "random"):
             days = played[grid, policy]
             rows.append([grid, {"nothing": "do nothing", "random": "at random"}[policy], *_earned(days)])
-        for seed, days in evaluated(cell):
-            rows.append([grid, f"{cell}, seed {seed}, learned", *_earned(days)])
+        for cell in cells:
+            for seed, days in evaluated(cell):
+                rows.append([grid, f"{cell}, seed {seed}, learned", *_earned(days)])
     return table(["grid", "policy", "mean return of 20 days", "days without a blackout"], rows)
 
 
