@@ -56,6 +56,17 @@ def test_list_of_environments(tmp_path: Path) -> None:
     assert "env.id=Hopper-v5" in lines["gym"]
 
 
+def test_one_that_cannot_be_made_leaves_the_others_listed(tmp_path: Path) -> None:
+    (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "absent.yaml").write_text("name: absent\nid: no_such_module:Absent-v0\nsource: absent\n")
+    done = run(tmp_path, "--config-dir", str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = {line.split()[0]: line for line in done.stdout.splitlines()}
+    assert "cannot import no_such_module" in lines["absent"]
+    # In the order of their names it comes first.
+    assert "Humanoid-v4" in lines["humanoid"]
+
+
 def test_unknown_name(tmp_path: Path) -> None:
     done = run(tmp_path, "humanod")
     assert (done.returncode, done.stdout) == (2, "")

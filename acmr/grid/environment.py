@@ -45,7 +45,7 @@ class PowerGridEnv(gym.Env[np.ndarray, np.ndarray]):
         Args:
             grid: One that comes with grid2op.
             decommissioned: Names of generators and storage units that are gone: they have neither sensors nor commands,
-                and what such a generator would have produced is produced by the other dispatchable ones.
+                and the other generators produce in the place of such a one.
 
         Raises:
             ValueError: If there is no such grid or component, or if nothing would be left to command.

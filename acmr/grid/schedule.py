@@ -29,9 +29,14 @@ def schedule_without(gone: Sequence[str]) -> type[GridStateFromFile]:
 def moved(power: np.ndarray, gone: np.ndarray) -> np.ndarray:
     """The schedule with what the gone generators produce shared among the others in proportion to their own.
 
+    Wind and sun are no exception, which is a simplification: in the grids of this project their part is small.
+
     Args:
         power: In MW, (steps, generators).
         gone: (generators,).
+
+    Returns:
+        In MW, (steps, generators), with the same sum at each step where at least one of the others produces.
     """
     kept = np.where(gone, 0, power)
     total, left = power.sum(axis=1, keepdims=True), kept.sum(axis=1, keepdims=True)
