@@ -122,8 +122,12 @@ def test_each_entry_matters(base):
         # All else is the same code as with the other learner.
         names = [name for name in names if name.startswith(("torch/agent/", "state/agent/"))]
     assert len(names) > 40
+    # Most entries matter at the later step already, from which there is less to train.
+    later_first = STEPS[::-1]
     without_effect = [
-        name for name in names if all(outcome(folder, step, run.overrides, name, fresh) == made[step] for step in STEPS)
+        name
+        for name in names
+        if all(outcome(folder, step, run.overrides, name, fresh) == made[step] for step in later_first)
     ]
     assert without_effect == []
     # With nothing left out nothing changes: it was the entries that mattered.
