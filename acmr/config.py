@@ -7,9 +7,10 @@ Values live in ``conf/``; this module gives them types. Nothing here knows where
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
+
+from acmr.text import flatten
 
 #: Settings that cannot change what a run computes: they are no part of a run's name.
 NEUTRAL_KEYS = (
@@ -267,17 +268,6 @@ class ExperimentConfig:
     def most_steps(self) -> int:
         """Environment steps after which the run ends at the latest."""
         return self.total_timesteps if self.stop_after is None else self.stop_after
-
-
-def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as ``{"agent.q_lr": 0.001, ...}``; lists are values."""
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        if isinstance(value, Mapping) and value:
-            flat |= flatten(value, f"{prefix}{key}.")
-        elif not isinstance(value, Mapping):
-            flat[f"{prefix}{key}"] = value
-    return flat
 
 
 def plain_settings(config: ExperimentConfig) -> dict[str, Any]:

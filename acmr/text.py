@@ -1,10 +1,11 @@
-"""Errors, durations, sizes and names as text for the user; the standard library only, so that all may use it."""
+"""Errors, durations, sizes, names and settings as text for the user; standard library only, so that all may use it."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import takewhile
+from typing import Any
 
 from acmr.names import terminal
 
@@ -127,3 +128,14 @@ def _cut(start: str, rest: str, place: int, width: int, mark: str) -> str:
     if len(rest) < width:
         return start[: width - 1 - len(rest)] + mark + rest
     return f"{rest[:place]}{mark}{rest[len(rest) - (width - 1 - place) :]}"
+
+
+def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as ``{"agent.q_lr": 0.001, ...}``; lists are values."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flatten(value, f"{prefix}{key}.")
+        elif not isinstance(value, Mapping):
+            flat[f"{prefix}{key}"] = value
+    return flat

@@ -17,7 +17,6 @@ from acmr.config import (
     TEACHER_CHOICE,
     ConfigError,
     SACConfig,
-    flatten,
     plain_settings,
     schema_defaults,
 )
@@ -25,6 +24,7 @@ from acmr.settings.compose import CONFIG_FOLDER, compose_config, parse
 from acmr.settings.errors import USER_ERRORS, check_booleans, explain
 from acmr.settings.run_spec import specify, teacher_spec
 from acmr.storage.run_dir import differing_keys
+from acmr.text import flatten
 
 LEAVES = [
     f"{path.parent.name}={path.stem}"

@@ -19,10 +19,11 @@ import yaml
 from test_security_secrets import older
 
 from acmr import foreign
-from acmr.config import ConfigError, flatten
+from acmr.config import ConfigError
 from acmr.evaluation.evaluate import load_run
 from acmr.records import DamagedError
 from acmr.storage.run_dir import RunDir
+from acmr.text import flatten
 from acmr.tracking.mirror import rebuild
 from acmr.transfer.teacher import load_teacher
 from analysis import publish as publishing
@@ -39,9 +40,8 @@ SUMMARY = {
     "status": "complete", "cell": "A2", "run": "ant-none", "profile": "quick", "env": "ant_three_legs",
     "transfer": "hidden", "freeze": True, "seed": 3, "global_step": 300, "total_timesteps": 300,
     "stop": "horizon", "stop_after": None, "episodes": 30, "threshold": 4900.0, "consecutive": 5,
-    "steps_to_threshold": None, "censored": True,
-    "final_return": 25.0, "steps_per_second": 300.0, "wall_seconds": 1.0, "versions": {"torch": "2"},
-    "git_commit": "a", "machine": {"system": "Linux"}, "physics_warnings": {}, "inexact_resumes": [],
+    "steps_to_threshold": None, "censored": True, "final_return": 25.0, "steps_per_second": 300.0,
+    "wall_seconds": 1.0, "versions": {"torch": "2"}, "git_commit": "a", "machine": {"system": "Linux"}, "physics_warnings": {}, "inexact_resumes": [],
     "cause": "x", "step": 3, "note": "x",
 }  # fmt: skip
 STATUS = {

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from safetensors.numpy import load_file
 from torture import ANT, Run, at_step, parts, same
 
-from acmr.config import ExperimentConfig, flatten
+from acmr.config import ExperimentConfig
 from acmr.records import meets_threshold, steps_to_threshold
 from acmr.run import checkpointing
+from acmr.text import flatten
 
 CONSECUTIVE = 3
 #: Twelve episodes of 25 steps; learning starts within the third.

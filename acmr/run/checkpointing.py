@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from acmr.config import INEXACT, TEACHER_CHOICE, ConfigError, ExperimentConfig, flatten, is_neutral, schema_defaults
+from acmr.config import INEXACT, TEACHER_CHOICE, ConfigError, ExperimentConfig, is_neutral, schema_defaults
 from acmr.envs.state import ANYTIME, NEVER
 from acmr.records import DamagedError
 from acmr.run.preparation import Prepared
@@ -22,6 +22,7 @@ from acmr.storage.checkpoint_store import KEPT, FormatError, Snapshot, SnapshotS
 from acmr.storage.durable import WriteError
 from acmr.storage.hold import RunHeldError
 from acmr.storage.run_dir import RunDir
+from acmr.text import flatten
 from acmr.tracking.observer import Observer
 
 #: Steps between two checkpoints where none are set: a share of the run, within these bounds.

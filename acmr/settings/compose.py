@@ -23,12 +23,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue
 
 from acmr.command import typed
-from acmr.config import ConfigError, EnvConfig, ExperimentConfig, TransferRules, flatten, schema_defaults
+from acmr.config import ConfigError, EnvConfig, ExperimentConfig, TransferRules, schema_defaults
 from acmr.settings.files import read_files_with_care
 from acmr.settings.sources import SWEEPS, Sources
 from acmr.settings.validate import validate
 from acmr.settings.variables import refuse_variables
-from acmr.text import holds_userinfo
+from acmr.text import flatten, holds_userinfo
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 #: The project's settings files: within the package where it is installed, beside it in a checkout.

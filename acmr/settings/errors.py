@@ -17,11 +17,11 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from acmr.command import typed
-from acmr.config import ConfigError, ExperimentConfig, flatten
+from acmr.config import ConfigError, ExperimentConfig
 from acmr.names import terminal
 from acmr.settings.compose import groups, launchers, options, setting_keys, sources, unknown_key
 from acmr.settings.files import place_of_key, place_of_text, wrong_kind
-from acmr.text import message, without_userinfo
+from acmr.text import flatten, message, without_userinfo
 
 #: Settings whose entries are free; Hydra adds to them with a plus sign only.
 FREE_KEYS = ("env.kwargs", "agent.options", "transfer.options", "tracking.options")

@@ -17,13 +17,13 @@ from acmr.config import (
     ConfigError,
     ExperimentConfig,
     SACConfig,
-    flatten,
     is_neutral,
     plain_settings,
 )
 from acmr.foreign import DESCRIPTIONS, read_mapping
 from acmr.records import DESCRIPTION_FILE, DamagedError
 from acmr.settings.compose import as_override, baseline, compose_config, env_overrides, parse, sources
+from acmr.text import flatten
 
 #: Settings that a run's name spells out in its own way.
 _NAMED_KEYS = ("seed", "freeze", "agent.name", "transfer.name", *TEACHER_CHOICE, "env.name")

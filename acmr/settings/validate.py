@@ -25,11 +25,10 @@ from acmr.config import (
     ConfigError,
     EnvConfig,
     ExperimentConfig,
-    flatten,
     share_of_mean,
 )
 from acmr.records import MOST_CONSECUTIVE, MOST_RETURN, MOST_SEED
-from acmr.text import holds_userinfo
+from acmr.text import flatten, holds_userinfo
 
 #: Settings are stored with the run.
 NO_USERINFO = (

@@ -16,7 +16,6 @@ from acmr.config import (
     TEACHER_CHOICE,
     ConfigError,
     ExperimentConfig,
-    flatten,
     is_neutral,
     plain_settings,
     schema_defaults,
@@ -55,7 +54,7 @@ from acmr.storage.durable import (
 )
 from acmr.storage.hold import LOCK_FILE, LostError, hold
 from acmr.storage.json_files import read_json, replace_json, write_json
-from acmr.text import message, one_line
+from acmr.text import flatten, message, one_line
 
 #: Files that a run writes anew when it starts from the beginning; what would make it look finished goes first.
 _RESULTS = (

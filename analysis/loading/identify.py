@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from acmr.cells import CELLS, SOURCE, Cell, plain_name, run_name
-from acmr.config import flatten
 from acmr.foreign import real_path
 from acmr.records import SEED_FOLDER
+from acmr.text import flatten
 from analysis.loading.values import MOST_SEED
 
 #: (source, target) environments of the profiles, for runs of which only the directory's name is left.

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from acmr.config import flatten
 from acmr.foreign import is_file
 from acmr.records import CONFIG_FILE, EPISODES_FILE, FILES_ENTRY, METRICS_FILE, STATUS_FILE, SUMMARY_FILE, DamagedError
 from acmr.run_folders import changes
+from acmr.text import flatten
 from analysis.loading.values import check_numbers, read_mapping
 
 #: Parts that every ``config.yaml`` of a run has, in their order there; what is cut off lacks the last of them.

@@ -8,7 +8,8 @@ from typing import Any
 
 import pandas as pd
 
-from acmr.config import flatten, schema_defaults
+from acmr.config import schema_defaults
+from acmr.text import flatten
 from analysis.loading.load import RunSet
 
 #: Settings whose differences make the cells, beside what a cell itself changes.
