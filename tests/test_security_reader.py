@@ -41,8 +41,8 @@ SUMMARY = {
     "transfer": "hidden", "freeze": True, "seed": 3, "global_step": 300, "total_timesteps": 300,
     "stop": "horizon", "stop_after": None, "episodes": 30, "threshold": 4900.0, "consecutive": 5,
     "steps_to_threshold": None, "censored": True, "final_return": 25.0, "steps_per_second": 300.0,
-    "wall_seconds": 1.0, "versions": {"torch": "2"}, "git_commit": "a", "machine": {"system": "Linux"}, "physics_warnings": {}, "inexact_resumes": [],
-    "cause": "x", "step": 3, "note": "x",
+    "wall_seconds": 1.0, "versions": {"torch": "2"}, "git_commit": "a",
+    "machine": {"system": "Linux"}, "physics_warnings": {}, "inexact_resumes": [], "cause": "x", "step": 3, "note": "x",
 }  # fmt: skip
 STATUS = {
     "state": "running", "global_step": 20, "total_timesteps": 300, "steps_per_second": 5.0, "latest_return": 1.0,
