@@ -194,6 +194,8 @@ def _hash(env: gym.Env[Any, Any]) -> str:
     spec = env.spec
     assert spec is not None
     entry: Any = spec.entry_point
-    place = entry if isinstance(entry, str) else f"{entry.__module__}:{entry.__qualname__}"
-    registration = {"id": spec.id, "entry_point": place, "kwargs": spec.kwargs}
+    # Some register a function with arguments, a functools.partial, which has no name of its own.
+    named, arguments = getattr(entry, "func", entry), getattr(entry, "keywords", {})
+    place = entry if isinstance(entry, str) else f"{named.__module__}:{named.__qualname__}"
+    registration = {"id": spec.id, "entry_point": place, "kwargs": {**arguments, **spec.kwargs}}
     return hashlib.sha256(json.dumps(registration, default=str, sort_keys=True).encode()).hexdigest()

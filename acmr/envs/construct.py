@@ -7,6 +7,7 @@ import copy
 import importlib
 import inspect
 import re
+import traceback
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -27,6 +28,10 @@ from acmr.text import brief, one_line
 
 #: What MuJoCo says of Gymnasium's own model files, of no use to who runs them.
 _MODEL_REMARK = r"compiler attribute .* is deprecated"
+#: What dm_control says where there is no screen, of no use to who trains.
+_SCREEN_REMARK = r".*The DISPLAY environment variable is missing"
+#: The package of DeepMind's environments, and which one registers them with Gymnasium.
+_DM_CONTROL, _SHIMMY = "dm_control", "shimmy"
 
 
 def find_spec(env_id: str) -> EnvSpec:
@@ -40,7 +45,8 @@ def find_spec(env_id: str) -> EnvSpec:
     module, _, name = env_id.rpartition(":")
     if module:
         try:
-            importlib.import_module(module)
+            with _quiet_models():
+                importlib.import_module(module)
         except KeyboardInterrupt:
             raise
         except BaseException as error:
@@ -49,6 +55,8 @@ def find_spec(env_id: str) -> EnvSpec:
     if spec is None or _is_stub(spec):
         near = near_matches(name, gym_ids())
         hint = f"; near: {', '.join(near)}" if near else ""
+        if name.startswith(f"{_DM_CONTROL}/") and not module:
+            hint = f"; type env.id={_SHIMMY}:{name}, once pip install '{_SHIMMY}[dm-control]' is done"
         raise ConfigError(f"env.id={env_id}: Gymnasium knows no such environment{hint}")
     return spec
 
@@ -127,6 +135,7 @@ def _quiet_models() -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", _MODEL_REMARK)
+            warnings.filterwarnings("ignore", _SCREEN_REMARK)
             yield
     finally:
         mujoco.set_mju_user_warning(before)
@@ -157,7 +166,20 @@ def _reason(config: EnvConfig, creator: Any, error: BaseException) -> str:
             if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
         ]
         return f"env.kwargs.{unknown[1]}: {config.id} has no such argument; it has {', '.join(allowed) or 'none'}"
+    if _is_mujoco_too_new(error):
+        return (
+            f"env.id={config.id}: {_DM_CONTROL} does not run with MuJoCo {mujoco.__version__}, which has no more a part that "
+            f"it needs ({one_line(error)}); it does with MuJoCo 3: pip install 'mujoco<4', in an environment of its "
+            "own (pip says then that acmr wants MuJoCo 4)"
+        )
     return str(cannot_run(config, error))
+
+
+def _is_mujoco_too_new(error: BaseException) -> bool:
+    """Whether dm_control looked for a field of MuJoCo's model or data that MuJoCo 4 has no more."""
+    frames = traceback.walk_tb(error.__traceback__)
+    within = any(str(frame.f_globals.get("__name__")).split(".")[0] == _DM_CONTROL for frame, _ in frames)
+    return within and isinstance(error, AttributeError) and re.search(r"\bMj(Model|Data)\b", str(error)) is not None
 
 
 def _check_spaces(env_id: str, env: gym.Env[Any, Any]) -> None:
