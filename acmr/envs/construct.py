@@ -168,8 +168,8 @@ def _reason(config: EnvConfig, creator: Any, error: BaseException) -> str:
         return f"env.kwargs.{unknown[1]}: {config.id} has no such argument; it has {', '.join(allowed) or 'none'}"
     if _is_mujoco_too_new(error):
         return (
-            f"env.id={config.id}: {_DM_CONTROL} does not run with MuJoCo {mujoco.__version__}, which has no more a part that "
-            f"it needs ({one_line(error)}); it does with MuJoCo 3: pip install 'mujoco<4', in an environment of its "
+            f"env.id={config.id}: {_DM_CONTROL} does not run with MuJoCo {mujoco.__version__}, which lacks what it "
+            f"needs ({one_line(error)}); it does with MuJoCo 3: pip install 'mujoco<4', in an environment of its "
             "own (pip says then that acmr wants MuJoCo 4)"
         )
     return str(cannot_run(config, error))
