@@ -4,10 +4,12 @@ import json
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from guides import ROOT
 
 from acmr.app.metric import metric_line, metric_of
@@ -138,3 +140,50 @@ def test_hydras_basic_sweeper_leaves_nothing_but_runs(tmp_path):
         "error: hydra/launcher=local: trains for the sweeper of this program only; with hydra/sweeper=basic type "
         "hydra/launcher=basic, or leave it out\n"
     )
+
+
+def test_a_plugin_that_cannot_be_loaded_or_makes_no_sweeper_of_its_settings_is_one_line(tmp_path):
+    plugins = tmp_path / "hydra_plugins" / "hydra_picky_sweeper"
+    plugins.mkdir(parents=True)
+    # As nevergrad's and Ax's of 2021 do with Python 3.11.
+    (plugins / "__init__.py").touch()
+    (plugins / "broken.py").write_text("raise ValueError('mutable default')\n")
+    done = start(tmp_path, *TINY)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "error: Hydra's plugin hydra_picky_sweeper cannot be loaded (ValueError: mutable default); install another "
+        "version of it, or type pip uninstall hydra-picky-sweeper\n"
+    )
+    (plugins / "broken.py").unlink()
+    (tmp_path / "hydra_plugins" / "recorder.py").write_text(
+        "from hydra._internal.core_plugins.basic_sweeper import BasicSweeper\n\nclass Picky(BasicSweeper):\n"
+        "    def __init__(self, budget):\n        self.budget = int(budget)\n\n"
+        "    def sweep(self, arguments):\n        raise KeyError(f'no such value: {arguments[-1]}')\n"
+    )
+    file = tmp_path / "conf" / "hydra" / "sweeper" / "picky.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text("_target_: hydra_plugins.recorder.Picky\nbudget: many\n")
+    words = ("-m", "--config-dir", "conf", "hydra/sweeper=picky", *TINY)
+    done = start(tmp_path, *words)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: hydra.sweeper: ")
+    assert "invalid literal for int() with base 10: 'many'" in done.stderr
+    assert done.stderr.count("\n") == 1
+    done = start(tmp_path, *words, "hydra.sweeper.budget=3", "seed=7")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: hydra/sweeper=picky: KeyError: 'no such value: seed=7'\n"
+
+
+@pytest.mark.slow
+def test_nevergrad_is_told_what_runs_are_worth(tmp_path):
+    if find_spec("nevergrad") is None:
+        pytest.skip("nevergrad not installed; type pip install -c constraints.txt hydra-nevergrad-sweeper==1.4.0.dev10")
+    done = start(
+        tmp_path, "-m", "hydra/sweeper=nevergrad", "hydra.sweeper.optim.budget=3", "hydra.sweeper.optim.maximize=true",
+        *TINY, "metric=final_return", "agent.q_lr=interval(1e-4,1e-2)",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found = yaml.safe_load((tmp_path / "optimization_results.yaml").read_text())
+    summaries = [json.loads(path.read_text()) for path in (tmp_path / "runs").glob("*/*/seed_1/summary.json")]
+    assert len(summaries) == 3
+    assert found["best_evaluated_result"] == pytest.approx(max(each["final_return"] for each in summaries))

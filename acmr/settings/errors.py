@@ -67,6 +67,10 @@ def _explained(error: BaseException) -> str:
     if not text.strip() and error.__cause__ is not None:
         # Hydra says nothing of what it found in a value.
         return _explained(error.__cause__)
+    if text.startswith("Error in call to target") and error.__cause__ is not None:
+        # A sweeper or a launcher that is not ours; Hydra's own line says which class it is of, not what is wrong.
+        key = text.rpartition("full_key: ")[2].strip() if "full_key: " in text else "hydra"
+        return f"{key}: {_explained(error.__cause__)}"
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         return _wrong_value(str(error.full_key), text)
     return text.strip().splitlines()[0] if text.strip() else type(error).__name__

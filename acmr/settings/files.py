@@ -18,17 +18,38 @@ from omegaconf import DictConfig, ListConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from acmr.config import ConfigError
-from acmr.text import message
+from acmr.text import message, one_line
 
 #: What Hydra calls places that belong to it.
 THEIRS = ("hydra", "schema")
+_PLUGINS = "hydra_plugins."
 
 
 def read_files_with_care() -> None:
     """Lets Hydra refuse a settings file that it cannot read as we do, in place of a traceback."""
     # Hydra makes its own entries first, and tells sources apart by what their addresses begin with.
-    Plugins.instance()
+    load_plugins()
     SourcesRegistry.instance().types |= {"file": FileConfigSource, "pkg": ImportlibResourcesConfigSource}
+
+
+def load_plugins() -> None:
+    """Lets Hydra load what is installed of its plugins; one that cannot be loaded would end every command.
+
+    Raises:
+        ConfigError: If there is such a one.
+    """
+    try:
+        Plugins.instance()
+    except Exception as error:
+        within = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+        name = next((module for module in reversed(within) if module.startswith(_PLUGINS)), "")
+        if not name:
+            raise
+        package = name.removeprefix(_PLUGINS).partition(".")[0]
+        raise ConfigError(
+            f"Hydra's plugin {package} cannot be loaded ({one_line(error)}); install another version of it, "
+            f"or type pip uninstall {package.replace('_', '-')}"
+        ) from error
 
 
 def shown(source: ConfigSource, name: str) -> str:
