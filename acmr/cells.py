@@ -68,6 +68,15 @@ class Cell:
         return self.role == SOURCE and self.transfer == TransferConfig().name and not self.changes
 
 
+#: What is taken by name, in the beginning that the paper's students have.
+_WEIGHTS_ALONE = {
+    "agent.kickstart": 0.0,
+    "agent.start": "random",
+    "agent.warmup": 0,
+    "transfer.copy_log_alpha": False,
+    "transfer.impute": "mean",
+}
+
 #: Every cell by its name, in the order of tables: first the paper's (paper, table 2), then those that go beyond it.
 CELLS = {
     cell.name: cell
@@ -79,6 +88,7 @@ CELLS = {
         Cell("A2", TARGET, "hidden", True, "Conf. 2", "A0", "transfer", "green", "^", published=True),
         Cell("A3", TARGET, "expand", False, "Conf. 3", "A0", "transfer", "red", "D", published=True),
         Cell("A4", TARGET, "expand", True, "Conf. 4", "A0", "transfer", "purple", "v", published=True),
+        Cell("N0", TARGET, "named", False, "By name, weights", "A0", "named", "olive", "d", _WEIGHTS_ALONE),
         Cell("N1", TARGET, "named", False, "By name", "A0", "named", "pink", "*"),
         Cell("N2", TARGET, "named", False, "By name, random", "A0", "named", "gray", "p", {"agent.start": "random"}),
     )

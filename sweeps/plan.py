@@ -105,7 +105,8 @@ def make_plan(specs: Sequence[RunSpec]) -> Plan:
     """Adds the teachers that students imply, and finds out what is there already.
 
     A run that stops at its threshold is not made where the full one, whose beginning it is, teaches another of them or
-    is there already; nor one with ``seeding=independent`` where it would be trained beside the teacher of the others.
+    is there already; nor one with ``seeding=independent`` where it would be trained beside the teacher of the others;
+    nor one that takes nothing, in a body that its teacher's teacher has, too.
 
     Args:
         specs: Runs in different directories.
@@ -159,7 +160,23 @@ def _stand_ins(specs: Sequence[RunSpec]) -> dict[Path, RunSpec]:
     students = [spec for spec in specs if (full or paired) and spec.config.transfer.rules.needs_teacher]
     teaching = {teacher_spec(spec.config).directory for spec in students if spec.config.transfer.teacher is None}
     found = {place: spec for place, spec in full.items() if spec.directory in teaching or _is_there(spec)}
+    found |= {spec.directory: twin for spec in specs if (twin := _twin(spec)) is not None}
     return found | {place: spec for place, spec in paired.items() if spec.directory in teaching}
+
+
+def _twin(spec: RunSpec) -> RunSpec | None:
+    """The same run under another name, if there is one: the baseline of a body that gets back what its teacher lost.
+
+    To such a body its teacher's teacher is another name, and a run that takes nothing does not depend on its teacher.
+    """
+    env = spec.config.env
+    if spec.config.transfer.rules.needs_teacher or env.source == env.name:
+        return None
+    twin = teacher_spec(teacher_spec(spec.config).config)
+    named = replace(env, name=twin.config.env.name, source=twin.config.env.source)
+    known = {key: getattr(spec.config, key) for key in (*_SHARED_KEYS, "force", "metric")}
+    twin = replace(twin, config=replace(twin.config, **known))
+    return twin if twin.config == replace(spec.config, env=named) else None
 
 
 def _is_there(spec: RunSpec) -> bool:

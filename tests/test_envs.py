@@ -26,6 +26,21 @@ DIMENSIONS = {
     "armless_humanoid_v5": (242, 11),
     "ant": (27, 8),
     "ant_three_legs": (23, 6),
+    "whole_ant": (27, 8),
+    "ant_leg_lost": (23, 6),
+    "ant_leg_added": (27, 8),
+    "whole_walker2d": (17, 6),
+    "walker2d_foot_lost": (15, 5),
+    "walker2d_foot_added": (17, 6),
+    "whole_halfcheetah": (17, 6),
+    "halfcheetah_motor_failed": (17, 5),
+    "halfcheetah_motor_added": (17, 6),
+    "whole_hopper": (11, 3),
+    "hopper_sensors_failed": (8, 3),
+    "hopper_sensors_added": (11, 3),
+    "whole_humanoid": (45, 17),
+    "humanoid_arm_lost": (39, 14),
+    "humanoid_arm_added": (45, 17),
 }
 #: All robots; the power grids are in tests/test_grid.py, for they need an extra.
 NAMED_LEAVES = [name for name in options("env") if name != "gym" and not name.startswith("grid")]
@@ -87,7 +102,7 @@ def test_every_leaf_builds_resets_and_steps(name: str) -> None:
 
 def test_leaves_are_all_here() -> None:
     assert set(options("env")) >= {*DIMENSIONS, "gym"}
-    pairs = {"paper": "humanoid", "quick": "ant", "paper_v5": "humanoid_v5"}
+    pairs = {"paper": "humanoid", "quick": "ant", "paper_v5": "humanoid_v5", "shifts": "whole_ant"}
     for profile, source in pairs.items():
         assert environment_config(f"{profile}_source") == environment_config(source)
         assert environment_config(f"{profile}_target").source == source
@@ -171,7 +186,9 @@ def test_several_dimensions_are_flattened() -> None:
 def test_hash_tells_models_apart_and_only_those() -> None:
     hashes = {name: describe(environment_config(name)).model_hash for name in DIMENSIONS}
     assert hashes["humanoid"] == hashes["humanoid_v5"]
-    assert len(set(hashes.values())) == 4
+    # A sensor or a motor that failed is no other robot.
+    assert hashes["whole_hopper"] == hashes["hopper_sensors_failed"]
+    assert len(set(hashes.values())) == 9
     code = (
         "from acmr.envs import describe; from acmr.settings.compose import environment_config;"
         "print(describe(environment_config('ant_three_legs')).model_hash)"

@@ -137,7 +137,10 @@ def test_a_sweep_trains_what_it_has_planned_whatever_becomes_of_the_files(own: P
             "error: hydra.searchpath: pkg://nowhere.conf: there is no such package",
         ),
         (["--config-path", "/nowhere"], "error: Primary config directory not found."),
-        (["--config-dir", "own", "env=my_targt"], "env=my_targt: must be one of ant, ant_three_legs, armless_humanoid"),
+        (
+            ["--config-dir", "own", "env=my_targt"],
+            "env=my_targt: must be one of ant, ant_leg_added, ant_leg_lost, ant_three_legs",
+        ),
         (["--config-dir", "own", "env=my_targt"], "did you mean env=my_target?"),
         (["--config-dir", "own", "-m", "env=my_target,my_surce"], "did you mean env=my_source?"),
     ],
