@@ -225,8 +225,10 @@ class ExperimentConfig:
     #: How it is used, a file in ``conf/seeding``: runs of one seed are ``paired`` (they share environment seed, random
     #: first actions and fresh weights) or ``independent`` (streams from the seed and the run's name).
     seeding: str = PAIRED
-    #: Whether what is copied from the teacher stays as it is.
+    #: Whether what is copied from the teacher stays as it is; on the command line a file in ``conf/freeze``.
     freeze: bool = False
+    #: Steps at which that begins to learn again: at each the layer next to the output, at the last all that are left.
+    thaw: list[int] = field(default_factory=list)
     #: Environment steps that the run takes.
     total_timesteps: int = 1_000_000
     #: Raw episodic return that counts as success.

@@ -54,6 +54,8 @@ def test_every_leaf_of_every_group_composes(leaf):
     needs = {
         "env=gym": ["env.id=Hopper-v5"],
         "tracking=self_hosted": ["tracking.base_url=http://127.0.0.1:1"],
+        "freeze=true": ["transfer=hidden"],
+        "freeze=gradual": ["transfer=hidden"],
     }
     assert spec(leaf, *needs.get(leaf, [])).config.seed == 1
 
@@ -124,7 +126,8 @@ def test_python_defaults_say_what_the_files_of_the_paper_say():
         ([f"agent.batch_size={2**63}"], f"agent.batch_size={2**63}: an integer of at most"),
         ([f"agent.hidden_sizes=[8,{2**63}]"], f"agent.hidden_sizes=[8, {2**63}]: integers of at most"),
         (["threads=100000"], "threads=100000: an integer of at most 4096"),
-        (["freeze=2"], "freeze=2: must be true or false"),
+        (["freeze=2"], "freeze=2: must be one of false, gradual, true"),
+        (["force=2"], "force=2: must be true or false"),
         (["agent.tau=0"], "agent.tau=0.0: a number in (0, 1]"),
         (["agent.gamma=1.5"], "agent.gamma=1.5: a number in [0, 1]"),
         (["agent.q_lr=nan"], "agent.q_lr=nan"),

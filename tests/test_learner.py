@@ -11,8 +11,9 @@ from torch import nn
 from acmr.agent import precision as matmul_precision
 from acmr.agent.architecture import LOG_STD_BOUNDS, Architecture, Dimensions
 from acmr.agent.kernels import arrays
+from acmr.agent.kernels.adam import Adam
 from acmr.agent.kernels.layers import CriticStack, Stack, columns
-from acmr.agent.kernels.parameters import Adam, FlatParameters
+from acmr.agent.kernels.parameters import FlatParameters
 from acmr.agent.kernels.policy import SquashedGaussian
 from acmr.agent.networks import Networks
 from acmr.agent.replay_buffer import ReplayBuffer

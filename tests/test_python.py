@@ -68,7 +68,7 @@ def test_a_run_is_the_one_that_the_command_makes_and_says_nothing(folder, monkey
         (["seed=1,2"], {}, "several values are several runs"),
         (["matrix=quick", "plan=true"], {}, "words of a sweep; train\\(\\) makes one run"),
         (["-m", "seed=1"], {}, "-m: an option of the command line"),
-        ([], {"freeze": 2}, "freeze=2: must be true or false"),
+        ([], {"freeze": 2}, "freeze=2: must be one of false, gradual, true"),
         ([], {"agent.gama": 1}, "agent.gama: no such setting; did you mean agent.gamma"),
         ([], {"config_dir": "nowhere"}, "--config-dir nowhere: there is no such folder"),
         (["transfer=expand", "profile=quick"], {"seed": 77}, "seed_77 does not exist; train it with: python run.py"),

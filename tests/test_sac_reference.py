@@ -82,14 +82,16 @@ def make_networks(
     return transfer(Student(fresh, *names), teacher, config, freeze, generator(6)).networks
 
 
-def assert_same_course(make: Callable[[], Networks], config: SACConfig, updates: int = UPDATES) -> None:
+def assert_same_course(
+    make: Callable[[], Networks], config: SACConfig, updates: int = UPDATES, thaws: dict[str, int] | None = None
+) -> None:
     """Updates both learners and compares every parameter, both targets, log_alpha and the metrics.
 
     Rounding grows as they learn: where a gradient is almost zero, Adam's step follows its sign. The plain learner
     with MKL's products and with oneDNN's differ by up to 5e-3 at the paper's shape after 100 updates (norm), so that
     float32 is compared on smaller networks, and the paper's shape in float64, element by element.
     """
-    fast, plain = (kind(make(), config, generator(1), generator(2)) for kind in (SAC, PlainSAC))
+    fast, plain = (kind(make(), config, generator(1), generator(2), thaws=thaws) for kind in (SAC, PlainSAC))
     start = {name: value.clone() for name, value in plain.networks.state_dict().items()}
     for step in range(1, updates + 1):
         batch = make_batch(plain.networks.dims, step, config.batch_size)

@@ -88,7 +88,7 @@ def test_the_files_of_the_guide_are_environments(conf: Path) -> None:
 def test_files_that_are_read_once_make_what_hydra_makes_of_them() -> None:
     """Of groups, values in them, added entries, removed settings: what compose_config takes from Hydra's inside."""
     for overrides in (
-        ["profile=quick", "transfer=hidden", "freeze=true", "agent.q_lr=1e-4", "agent.hidden_sizes=[8,8]"],
+        ["profile=quick", "transfer=hidden", "freeze='true'", "agent.q_lr=1e-4", "agent.hidden_sizes=[8,8]"],
         [
             "env=gym",
             "env.id=Hopper-v5",

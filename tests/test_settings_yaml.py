@@ -59,8 +59,8 @@ FAULTS: dict[str, tuple[str, str | bytes, str]] = {
     "unknown key unlike any": ("env", "zzzzzzzzzzzz: 1\n", "there are env.drop_actuators, env.drop_sensors"),
     "missing default": ("env", "defaults: [humanoyd]\n", "did you mean env=humanoid? (line 1, column 12)"),
     "missing group": ("env", "defaults:\n  - /transfr: hidden\n",
-                      "transfr=hidden: there is no group transfr, only agent, env, experiment, matrix, profile, "
-                      "seeding, tracking, transfer; did you mean transfer? (line 2, column 15)"),
+                      "transfr=hidden: there is no group transfr, only agent, env, experiment, freeze, matrix, "
+                      "profile, seeding, tracking, transfer; did you mean transfer? (line 2, column 15)"),
     "missing group, as a path": ("env", "defaults: [/transfr/hidden]\n", "there is no group transfr, only agent, env"),
     "missing override": ("experiment", "# @package _global_\ndefaults:\n  - override /evn: ant\n",
                          "override evn: there is no group evn, only agent, env,"),

@@ -179,7 +179,7 @@ def test_a_teacher_that_is_named_but_not_there_is_refused(out, tmp_path):
     [
         (product(transfer=["hiden", "expand"]), "did you mean transfer=hidden?"),
         (product(experiment=["H0", "B7"]), "experiment=B7: must be one of A0"),
-        (product(freeze=["true", "2"], transfer=["hidden"]), "freeze=2: must be true or false"),
+        (product(freeze=["true", "2"], transfer=["hidden"]), "freeze=2: must be one of false, gradual, true"),
         (product(transfer=["none", "hidden"], freeze=["true"]), "nothing to freeze"),
         (product(sed=["1", "2"]), "did you mean seed or seeding?"),
         (product(seed=["1", "x"]), "seed=x"),

@@ -44,6 +44,7 @@ class Learner(Protocol):
         learning: torch.Generator,
         log_alpha: float = 0.0,
         device: str = "cpu",
+        thaws: Mapping[str, int] | None = None,
     ) -> None: ...
 
     def act(self, observation: np.ndarray) -> np.ndarray:

@@ -10,18 +10,20 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from acmr.agent.fine_tuning import actor_learns, kickstart_weight, rate_share, set_biases
+from acmr.agent.fine_tuning import actor_learns, kickstart_weight, rate_share, set_biases, thaw
+from acmr.agent.kernels.adam import Adam, StagedAdam
 from acmr.agent.kernels.arrays import Array, array_of, math_of, tensor_of
 from acmr.agent.kernels.groups import actor_groups, critic_groups, heads, relus
 from acmr.agent.kernels.layers import CriticStack, Stack, columns
 from acmr.agent.kernels.origin import Origin
-from acmr.agent.kernels.parameters import Adam, FlatParameters
+from acmr.agent.kernels.parameters import FlatParameters
 from acmr.agent.kernels.policy import NumpyPolicy, Sample, SquashedGaussian
 from acmr.agent.learner import Means, learner, load_tensors
 from acmr.agent.networks import Critic, Networks
@@ -34,7 +36,7 @@ class SAC:
     """Learns networks from batches of transitions.
 
     The target critics start equal to the critics as they are given, so transfer and freezing come first.
-    Layers whose parameters do not require gradients are never stepped, and their target twins never move.
+    Layers whose parameters do not require gradients are not stepped until they thaw, nor do their target twins move.
     The parameters of the networks and targets become views into vectors that are learned as a whole.
 
     Args:
@@ -44,6 +46,7 @@ class SAC:
         learning: Generator of the noise of actions sampled in the updates.
         log_alpha: Initial log of the temperature.
         device: Where the networks live.
+        thaws: Environment step from which layers learn that do not require gradients now, by the layer's name.
     """
 
     precisions = PRECISIONS
@@ -56,12 +59,14 @@ class SAC:
         learning: torch.Generator,
         log_alpha: float = 0.0,
         device: str = "cpu",
+        thaws: Mapping[str, int] | None = None,
     ) -> None:
         self.networks, self.config, self.device = networks.to(device), config, device
         self._generators = {"acting": acting, "learning": learning}
         self.targets = copy.deepcopy(nn.ModuleList(networks.critics)).requires_grad_(False)
         self.target_entropy = -float(networks.dims.action)
         self._math = math_of(networks.actor.action_scale)
+        self._thaws: dict[nn.Module, int] = {networks.layers()[name]: step for name, step in (thaws or {}).items()}
         self._build_networks()
         start = log_alpha if config.autotune else math.log(config.alpha)
         self.log_alpha = torch.full((1,), start, device=device)
@@ -69,10 +74,11 @@ class SAC:
         self._alpha, self._log_alpha_gradient = self.log_alpha.exp(), torch.zeros(1, device=device)
         self._alpha_array = array_of(self._alpha)
         self._optimizers = {
-            "actor": Adam(self._actor_parameters.trainable, self._actor_parameters.gradient, config.policy_lr),
-            "critics": Adam(self._critic_parameters.trainable, self._critic_parameters.gradient, config.q_lr),
-            "log_alpha": Adam(self.log_alpha, self._log_alpha_gradient, config.q_lr),
+            "actor": StagedAdam.of(self._actor_parameters, config.policy_lr),
+            "critics": StagedAdam.of(self._critic_parameters, config.q_lr),
+            "log_alpha": StagedAdam({0: Adam(self.log_alpha, self._log_alpha_gradient, config.q_lr)}),
         }
+        self._thaw(0)
         self._means = Means()
         self._batch_size = 0
 
@@ -82,8 +88,8 @@ class SAC:
         # their application.
         self._reduced = self.config.precision == "bfloat16"
         low_actor, low_critics = ([self._reduced and not head for head in heads(net)] for net in (actor, critics[0]))
-        self._actor_parameters = FlatParameters(actor_groups(actor), reduced=low_actor)
-        self._critic_parameters = FlatParameters(critic_groups(critics), reduced=low_critics)
+        self._actor_parameters = FlatParameters(actor_groups(actor), None, low_actor, self._thaws)
+        self._critic_parameters = FlatParameters(critic_groups(critics), None, low_critics, self._thaws)
         target_groups = critic_groups([target for target in self.targets if isinstance(target, Critic)])
         self._target_parameters = FlatParameters(target_groups, self._critic_parameters, low_critics)
         # Whom the actor is held to at first: the policy as it was transferred.
@@ -95,9 +101,8 @@ class SAC:
         self._targets = CriticStack(self._target_parameters.blocks, active, dims.observation)
         bounded = (actor.action_scale, actor.action_bias, actor.log_std_rule)
         self._policy = SquashedGaussian(*bounded)
-        in_numpy = self._math is np
         acting = Stack(self._actor_parameters.masters, relus(actor)).layers
-        self._acting = NumpyPolicy(acting, *bounded) if in_numpy else None
+        self._acting = NumpyPolicy(acting, *bounded) if self._math is np else None
 
     @torch.no_grad()
     def act(self, observation: np.ndarray) -> np.ndarray:
@@ -122,6 +127,8 @@ class SAC:
             joined = joined.to(torch.bfloat16)
         if len(joined.rewards) != self._batch_size:
             self._allocate(len(joined.rewards))
+        if global_step >= self._next_thaw:
+            self._thaw(global_step)
         self._update_critics(joined)
         if global_step % self.config.policy_frequency == 0 and self._actor_learns:
             self._update_actor_and_temperature(joined.observations)
@@ -159,11 +166,20 @@ class SAC:
             generator.set_state(state["generators"][name])
         self._means.load_state_dict(state)
 
+    def _thaw(self, step: int) -> None:
+        # What has thawed follows from the step alone, which a learner that was restored is told with its next update.
+        self._next_thaw = thaw(self._thaws, step)
+        self._actor.let_learn(self._actor_parameters.learning(step))
+        self._critics.let_learn(self._critic_parameters.learning(step))
+        for optimizer in self._optimizers.values():
+            optimizer.thaw(step)
+
     def _refresh(self) -> None:
         for parameters in (self._actor_parameters, self._critic_parameters, self._target_parameters):
             parameters.refresh()
         if self._origin is not None:
             self._origin.parameters.refresh()
+        self._thaw(0)
 
     def _state_tensors(self) -> dict[str, Tensor]:
         moments = {
@@ -273,8 +289,7 @@ class SAC:
         return self._origin.pull((self._mean, self._raw), (self._of_mean, self._of_raw), weight * share)
 
     def _step(self, name: str) -> None:
-        optimizer = self._optimizers[name]
-        optimizer.step(rate_share(self.config, optimizer.updates) if self.config.warmup else 1.0)
+        self._optimizers[name].step(partial(rate_share, self.config) if self.config.warmup else None)
 
     def _update_temperature(self, sample: Sample) -> None:
         loss = -self._alpha_array[0] * (sample.log_prob @ self._average + self.target_entropy)

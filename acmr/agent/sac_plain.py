@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from acmr.agent.fine_tuning import actor_learns, kickstart_weight, rate_share, set_biases
+from acmr.agent.fine_tuning import NEVER, actor_learns, begin_of, kickstart_weight, rate_share, set_biases, thaw
 from acmr.agent.learner import Means, learner, load_tensors
-from acmr.agent.networks import Networks
+from acmr.agent.networks import Networks, Trunk
 from acmr.agent.replay_buffer import Batch
 from acmr.config import SACConfig
 
@@ -33,6 +33,7 @@ class PlainSAC:
         learning: Generator of the noise of actions sampled in the updates.
         log_alpha: Initial log of the temperature.
         device: Where the networks live.
+        thaws: Environment step from which layers learn that do not require gradients now, by the layer's name.
     """
 
     # Autograd through bfloat16 would need scaled losses and copies of the weights.
@@ -46,8 +47,10 @@ class PlainSAC:
         learning: torch.Generator,
         log_alpha: float = 0.0,
         device: str = "cpu",
+        thaws: Mapping[str, int] | None = None,
     ) -> None:
         self.networks, self.config, self.device = networks.to(device), config, device
+        self._thaws: dict[nn.Module, int] = {networks.layers()[name]: step for name, step in (thaws or {}).items()}
         self._generators = {"acting": acting, "learning": learning}
         self.targets = copy.deepcopy(nn.ModuleList(networks.critics)).requires_grad_(False)
         # Whom the actor is held to at first: the policy as it was transferred.
@@ -57,11 +60,11 @@ class PlainSAC:
         start = log_alpha if config.autotune else math.log(config.alpha)
         self.log_alpha = torch.full((1,), start, device=device, requires_grad=config.autotune)
         self._optimizers = {
-            "actor": _adam(networks.actor.parameters(), config.policy_lr),
-            "critics": _adam(nn.ModuleList(networks.critics).parameters(), config.q_lr),
+            "actor": _adam(self._learning([networks.actor]), config.policy_lr),
+            "critics": _adam(self._learning(networks.critics), config.q_lr),
         }
         if config.autotune:
-            self._optimizers["log_alpha"] = _adam([self.log_alpha], config.q_lr)
+            self._optimizers["log_alpha"] = _adam([[self.log_alpha]], config.q_lr)
         self._means = Means()
 
     @staticmethod
@@ -116,6 +119,8 @@ class PlainSAC:
         The critics learn at every step. Every ``policy_frequency`` steps the actor makes up for its delay
         with as many updates on this batch, each followed by a temperature update.
         """
+        # What has thawed follows from the step alone, so that no state has to hold it.
+        thaw(self._thaws, global_step)
         self._update_critics(batch)
         if global_step % self.config.policy_frequency == 0 and self._actor_learns:
             for _ in range(self.config.policy_frequency):
@@ -203,14 +208,26 @@ class PlainSAC:
         return not self.config.critics_first or actor_learns(self.config, _updates(self._optimizers["critics"]))
 
     def _step(self, name: str, loss: Tensor) -> None:
-        optimizer, group = self._optimizers[name], self._optimizers[name].param_groups[0]
-        if self.config.warmup:
-            lr = self.config.policy_lr if name == "actor" else self.config.q_lr
-            group["lr"] = lr * rate_share(self.config, _updates(optimizer))
-        # Gradients of these parameters only: the actor's loss must not leave any in the critics.
-        for parameter, gradient in zip(group["params"], torch.autograd.grad(loss, group["params"]), strict=True):
+        optimizer, learning = self._optimizers[name], []
+        optimizer.zero_grad()
+        for group in optimizer.param_groups:
+            if self.config.warmup:
+                lr = self.config.policy_lr if name == "actor" else self.config.q_lr
+                group["lr"] = lr * rate_share(self.config, _updates(optimizer, group))
+            learning += [parameter for parameter in group["params"] if parameter.requires_grad]
+        # Gradients of these parameters only: the actor's loss must not leave any in the critics. Adam passes over those
+        # that have none, which are those still frozen.
+        for parameter, gradient in zip(learning, torch.autograd.grad(loss, learning), strict=True):
             parameter.grad = gradient
         optimizer.step()
+
+    def _learning(self, networks: Iterable[Trunk]) -> list[list[Tensor]]:
+        """Parameters that learn, now or later: those that begin at the same step together, the first ones first."""
+        stages: dict[float, list[Tensor]] = {}
+        for network in networks:
+            for _, layer in network.layers():
+                stages.setdefault(begin_of(layer, self._thaws), []).extend(layer.parameters())
+        return [stages[begin] for begin in sorted(stages.keys() - {NEVER})]
 
     @torch.no_grad()
     def _update_targets(self) -> None:
@@ -219,15 +236,17 @@ class PlainSAC:
             torch._foreach_lerp_(list(target.parameters()), list(critic.parameters()), self.config.tau)
 
 
-def _adam(parameters: Iterable[Tensor], lr: float) -> torch.optim.Adam:
-    """Adam for the parameters that learn; frozen ones have no gradient to ask for."""
-    optimizer = torch.optim.Adam([each for each in parameters if each.requires_grad], lr=lr, foreach=True)
-    for parameter in optimizer.param_groups[0]["params"]:
+def _adam(stages: Iterable[list[Tensor]], lr: float) -> torch.optim.Adam:
+    """Adam for the parameters that learn, in groups that begin together."""
+    optimizer = torch.optim.Adam([{"params": parameters} for parameters in stages], lr=lr, foreach=True)
+    for parameter in (each for group in optimizer.param_groups for each in group["params"]):
         # As its first step would begin; made here, so that a state can be loaded before there was one.
         moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
         optimizer.state[parameter] = {"step": torch.zeros(()), **moments}
     return optimizer
 
 
-def _updates(optimizer: torch.optim.Adam) -> int:
-    return int(next(iter(optimizer.state.values()))["step"])
+def _updates(optimizer: torch.optim.Adam, group: Mapping[str, Any] | None = None) -> int:
+    """Steps that it has taken with one group of parameters; None: with those that began first."""
+    group = group or optimizer.param_groups[0]
+    return int(optimizer.state[group["params"][0]]["step"])

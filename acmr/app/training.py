@@ -61,7 +61,7 @@ def _train(cfg: DictConfig) -> float | None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
-    from acmr.settings.compose import CONFIG_FOLDER, look_in, parse
+    from acmr.settings.compose import CONFIG_FOLDER, check_choices, look_in, parse
     from acmr.settings.errors import check_booleans
     from acmr.settings.run_spec import specify
     from acmr.settings.sources import sources_of
@@ -73,6 +73,7 @@ def _train(cfg: DictConfig) -> float | None:
         hydra: Any = HydraConfig.get()
         look_in(sources_of(hydra, CONFIG_FOLDER))
         check_booleans(hydra.overrides.task)
+        check_choices(hydra.runtime.choices)
         found.append(_run(specify(parse(cfg)), searched=hydra.mode == RunMode.MULTIRUN))
 
     # An error that left from here would get a line of Hydra's own before it.

@@ -34,6 +34,7 @@ class Prepared:
         networks: Those that it starts with.
         report: What the transfer made of them.
         audition: Which of several ways to begin it takes.
+        thaws: Environment step from which its frozen layers learn, by their names.
         learner: Makes the learner that ``agent`` chooses.
         log_alpha: Logarithm of the temperature that it starts with.
         streams: Its random numbers.
@@ -46,6 +47,7 @@ class Prepared:
     networks: Networks
     report: TransferReport
     audition: Audition
+    thaws: dict[str, int]
     learner: Callable[..., Learner]
     log_alpha: float
     streams: RandomStreams
@@ -76,7 +78,7 @@ def prepare(spec: RunSpec) -> Prepared:
     check_memory(config, architecture)
     fresh = Networks(architecture, streams.networks)
     student = Student(fresh, about.observation_names, about.action_names)
-    transferred = transfer(student, teacher, config.transfer, config.freeze, streams.networks)
+    transferred = transfer(student, teacher, config.transfer, config.freeze, streams.networks, config.thaw)
     log_alpha = teacher.log_alpha() if teacher is not None and config.transfer.copy_log_alpha else 0.0
     return Prepared(
         spec=spec,
@@ -84,6 +86,7 @@ def prepare(spec: RunSpec) -> Prepared:
         networks=transferred.networks,
         report=transferred.report,
         audition=transferred.audition,
+        thaws=transferred.thaws,
         learner=learner,
         log_alpha=log_alpha,
         streams=streams,

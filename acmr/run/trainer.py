@@ -213,7 +213,14 @@ def make_trainer(prepared: Prepared, env: gym.Env[np.ndarray, np.ndarray], logs:
     return Trainer(
         env=env,
         agent=prepared.learner(
-            prepared.networks, config.agent, streams.acting, streams.learning, prepared.log_alpha, config.device
+            prepared.networks,
+            config.agent,
+            streams.acting,
+            streams.learning,
+            prepared.log_alpha,
+            config.device,
+            # A learner of the user's own need not know of it.
+            **({"thaws": prepared.thaws} if prepared.thaws else {}),
         ),
         buffer=_make_buffer(config, dims),
         streams=streams,

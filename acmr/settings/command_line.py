@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +17,18 @@ from hydra.errors import OverrideParseException
 
 from acmr.command import typed
 from acmr.config import ConfigError
-from acmr.settings.compose import CONFIG_FOLDER, PATH_KEYS, as_override, groups, look_in, options, setting_keys, sources
+from acmr.settings.compose import (
+    CONFIG_FOLDER,
+    PATH_KEYS,
+    as_override,
+    check_choices,
+    groups,
+    look_in,
+    options,
+    quote_choice,
+    setting_keys,
+    sources,
+)
 from acmr.settings.sources import SWEEPS, Sources
 from acmr.settings.validate import NO_USERINFO
 from acmr.text import holds_userinfo, without_userinfo
@@ -53,6 +65,9 @@ def hydra_arguments(given: Sequence[str]) -> list[str]:
             key = argument.partition("=")[0][:60]
             raise ConfigError(f"{key}: {len(argument):,} characters, at most {LONGEST_ARGUMENT:,} are taken")
     chosen = _check_options(given)
+    if chosen.shell_completion:
+        # The words that stand there already, which Hydra composes to know what may follow.
+        os.environ["COMP_LINE"] = " ".join(map(quote_choice, os.environ.get("COMP_LINE", "").split(" ")))
     searched = [place for argument in given if _is_search_path(argument) for place in _searched(argument)]
     folder = [f"file://{Path(chosen.config_dir).absolute()}"] if chosen.config_dir else []
     main = Path(chosen.config_path).absolute() if chosen.config_path else CONFIG_FOLDER
@@ -97,6 +112,11 @@ def _in_hydras_words(argument: str) -> str:
         return f"{SEARCH_PATH}={as_override([*dict.fromkeys([*_searched(argument), SWEEPS])])}"
     if _CALL.search(value) and key.lstrip("+") in groups():
         raise ConfigError(f"{key}={value}: is chosen by its name; type one of {', '.join(options(key.lstrip('+')))}")
+    argument = quote_choice(argument)
+    value = argument.partition("=")[2]
+    for chosen in value.replace("'", "").split(",") if key in groups() else []:
+        if chosen.isidentifier():
+            check_choices({key: chosen})
     if _NO_NAME.fullmatch(value) and key in groups():
         raise ConfigError(f"{key}={value}: must be one of {', '.join(options(key))}, or left out")
     return argument

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, fields, is_dataclass
 from difflib import get_close_matches
@@ -35,6 +35,9 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 CONFIG_FOLDER = next(filter(Path.is_dir, (_PACKAGE / "conf", _PACKAGE.parent / "conf")), _PACKAGE / "conf")
 #: Settings that are paths.
 PATH_KEYS = ("transfer.teacher", "output_dir", "tracking.dir")
+#: What stands for no choice of ``freeze`` in ``conf/config.yaml``.
+_UNSAID = "unsaid"
+_BOOLEAN = re.compile(r"(?<!['\"\w])(?:true|false)(?!['\"\w])", re.IGNORECASE)
 _given: Sources | None = None
 
 
@@ -111,12 +114,39 @@ def compose_config(overrides: Sequence[str]) -> DictConfig:
     """
     # Hydra reads and merges all files anew for every composition, 0.1 s of processor time. A sweep composes every run
     # several times (settings, baseline, teacher, command line), and nearly always from the same few choices of groups.
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    parsed = OverridesParser.create().parse_overrides([quote_choice(override) for override in overrides])
+    for entry in parsed:
+        if _chooses(entry) and not entry.is_sweep_override() and isinstance(entry.value(), int | float | None):
+            raise ConfigError(f"{entry.input_line}: must be one of {', '.join(options(entry.key_or_group))}")
     cfg = deepcopy(_composed(tuple(str(entry.input_line) for entry in parsed if _chooses(entry)), sources()))
     # Private, read in hydra-core 1.3.8: there is no public way to set values on a config that is composed already.
     # tests/test_hydra.py fails where it is gone, tests/test_settings_files.py where it makes other configs than Hydra.
     ConfigLoaderImpl._apply_overrides_to_config([entry for entry in parsed if not _chooses(entry)], cfg)
     return cfg
+
+
+def quote_choice(override: str) -> str:
+    """``freeze='true'`` for ``freeze=true``: of a group Hydra takes names only, and reads a bare true as none."""
+    key, equal, value = override.partition("=")
+    if _BOOLEAN.search(value) and key in groups() and {"true", "false"} <= set(options(key)):
+        return f"{key}{equal}{_BOOLEAN.sub(lambda match: repr(match[0].lower()), value)}"
+    return override
+
+
+def check_choices(choices: Mapping[str, object]) -> None:
+    """Refuses a choice of ``freeze`` that is not there.
+
+    Hydra passes over it: the group is optional, so that experiments may say ``freeze: true`` where nothing is chosen.
+
+    Args:
+        choices: Of all groups, as Hydra has them.
+
+    Raises:
+        ConfigError: Naming the options.
+    """
+    chosen, allowed = choices.get("freeze", _UNSAID), options("freeze")
+    if chosen not in (_UNSAID, *allowed):
+        raise ConfigError(f"freeze={chosen}: must be one of {', '.join(allowed)}")
 
 
 def _chooses(override: Override) -> bool:
@@ -130,7 +160,9 @@ def _chooses(override: Override) -> bool:
 def _composed(choices: tuple[str, ...], places: Sources) -> DictConfig:
     # The places are part of the key: a training of a sweep reads the copies that the sweep made (sweeps/job.py).
     register_schema()
-    return places.compose(list(choices))
+    cfg, chosen = places.compose(list(choices))
+    check_choices(chosen)
+    return cfg
 
 
 def _refuse_unknown(node: DictConfig, prefix: str = "") -> None:

@@ -77,7 +77,7 @@ def _explained(error: BaseException) -> str:
 
 
 def check_booleans(overrides: Sequence[str]) -> None:
-    """Refuses ``freeze=2`` and the like, which would pass as true.
+    """Refuses ``force=2`` and the like, which would pass as true.
 
     Raises:
         ConfigError: Naming the setting and what to type.
@@ -85,7 +85,7 @@ def check_booleans(overrides: Sequence[str]) -> None:
     flat = flatten(asdict(ExperimentConfig()))
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.key_or_group
-        if isinstance(flat.get(key), bool) and not override.is_sweep_override():
+        if isinstance(flat.get(key), bool) and key not in groups() and not override.is_sweep_override():
             value = override.value()
             if not isinstance(value, bool) and str(value).lower() not in ("true", "false"):
                 raise ConfigError(f"{key}={value}: must be true or false")

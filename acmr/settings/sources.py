@@ -50,14 +50,15 @@ class Sources:
         """The folder that everything begins in; None if it is a package."""
         return Path(self.paths[0].removeprefix(_FILE)) if self.paths[0].startswith(_FILE) else None
 
-    def compose(self, overrides: list[str]) -> DictConfig:
-        """Composes the settings, without those of Hydra."""
+    def compose(self, overrides: list[str]) -> tuple[DictConfig, dict[str, object]]:
+        """Composes the settings, without those of Hydra; returns them and what was chosen of each group."""
         loader = _loader(self.paths)
         with self.refusing_circles():
             cfg = loader.load_configuration(self.name, overrides, run_mode=RunMode.RUN, from_shell=False)
+        chosen = dict(cfg.hydra.runtime.choices)
         with open_dict(cfg):
             del cfg["hydra"]
-        return cfg
+        return cfg, chosen
 
     @contextmanager
     def refusing_circles(self) -> Iterator[None]:

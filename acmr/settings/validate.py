@@ -188,11 +188,26 @@ def _check_transfer(config: ExperimentConfig) -> None:
             else "without a transfer there is nothing to freeze"
         )
         raise ConfigError(f"{name} freeze=true: {why}; type freeze=false{rules.or_instead}")
+    _check_thaw(config)
     if len(sizes) < rules.min_hidden_layers:
         enough = ",".join(map(str, [*sizes, *sizes[-1:] * rules.min_hidden_layers][: rules.min_hidden_layers]))
         raise ConfigError(
             f"{name} agent.hidden_sizes={sizes}: it needs {rules.min_hidden_layers} hidden layers or more; "
             f"type agent.hidden_sizes=[{enough}]{rules.or_instead}"
+        )
+
+
+def _check_thaw(config: ExperimentConfig) -> None:
+    steps = config.thaw
+    given = f"thaw=[{','.join(map(str, steps))}]"
+    if steps and not config.freeze:
+        raise ConfigError(f"{given} freeze=false: nothing is frozen that could thaw; type freeze=true, or thaw=[]")
+    if steps != sorted(set(steps)) or min(steps, default=1) < 1:
+        raise ConfigError(f"{given}: steps are needed that ascend from 1 or more, as in thaw=[10000,20000]")
+    if steps and steps[0] >= config.most_steps:
+        raise ConfigError(
+            f"{given}: nothing would thaw before the run ends, at step {config.most_steps}; "
+            f"type thaw=[{max(1, config.most_steps // 2)}], or freeze=true thaw=[]"
         )
 
 

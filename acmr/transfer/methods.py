@@ -7,13 +7,14 @@ learn with and which layers came from the teacher. One of your own is a function
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
 from acmr.agent.architecture import Dimensions, is_hidden
+from acmr.agent.fine_tuning import thaw_schedule
 from acmr.agent.networks import Networks
 from acmr.config import ConfigError, TransferConfig
 from acmr.registry import Registry, named_in
@@ -67,11 +68,13 @@ class Transferred:
         networks: What it learns with.
         report: What became of each layer.
         audition: Which of several ways to begin it takes; there may be none to choose from.
+        thaws: Environment step from which frozen layers learn, by their names.
     """
 
     networks: Networks
     report: TransferReport
     audition: Audition
+    thaws: dict[str, int]
 
 
 #: Student, teacher (None where the method's rules say that it needs none), settings, source of new weights.
@@ -101,6 +104,7 @@ def transfer(
     config: TransferConfig,
     freeze: bool,
     generator: torch.Generator,
+    thaw: Sequence[int] = (),
 ) -> Transferred:
     """Gives a student what its method takes from the teacher, and freezes it where asked to.
 
@@ -110,6 +114,7 @@ def transfer(
         config: Method, its rules and its settings.
         freeze: Whether the copied layers stop learning.
         generator: Source of the weights of layers that a method adds.
+        thaw: Environment steps at which frozen layers begin to learn again, from the output down.
 
     Raises:
         ConfigError: If the teacher does not fit the method.
@@ -128,8 +133,15 @@ def transfer(
         # The learner reads this: frozen layers are no part of what its optimizers step, nor of what its targets follow.
         layers[name].requires_grad_(False)
     report = report_transfer(taken.networks, teacher, config, freeze, (taken.copied, taken.fitted, frozen))
-    report = replace(report, details=taken.details, notes=taken.lines)
-    return Transferred(taken.networks, report, Audition(taken.choices))
+    thaws = thaw_schedule(frozen, thaw)
+    details, notes = taken.details | ({"thaws": thaws} if thaws else {}), [*taken.lines, *_thaw_lines(thaws)]
+    report = replace(report, details=details, notes=notes)
+    return Transferred(taken.networks, report, Audition(taken.choices), thaws)
+
+
+def _thaw_lines(thaws: Mapping[str, int]) -> list[str]:
+    layers = {step: [name for name, begin in thaws.items() if begin == step] for step in sorted(set(thaws.values()))}
+    return [f"from step {step:,} on, these learn again: {', '.join(names)}" for step, names in layers.items()]
 
 
 def _bound_alike(taken: Taken, teacher: Teacher | None) -> Taken:

@@ -184,9 +184,14 @@ class Stack:
         # The first layer reads what no activations hold, so it is never the special case of one output.
         kinds = [Dense, *(Scalar if block.weight.shape[2] == 1 else Dense for block in blocks[1:])]
         self.layers = [kind(block, relu) for kind, block, relu in zip(kinds, blocks, relus, strict=True)]
-        learning = [index for index, layer in enumerate(self.layers) if layer.learns]
+        self.let_learn([layer.learns for layer in self.layers])
+
+    def let_learn(self, learning: Sequence[bool]) -> None:
+        """Says which layers learn; none can that has no gradient."""
+        for layer, learns in zip(self.layers, learning, strict=True):
+            layer.learns = learns
         # Below the lowest layer that learns nobody asks for a gradient: frozen cells end their way back there.
-        self._lowest_learning = min(learning, default=len(self.layers))
+        self._lowest_learning = learning.index(True) if any(learning) else len(self.layers)
 
     def allocate(self, batch_size: int) -> list[Activations]:
         """Memory for passes of batches of one size, by layer."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+
+from acmr.agent.fine_tuning import NEVER, begin_of
 
 #: Layers of equal shape that work side by side: by network, and within a network those that read the same input.
 Group = Sequence[Sequence[nn.Linear]]
@@ -19,7 +21,7 @@ _ALIGNMENT = 16
 
 @dataclass(frozen=True)
 class LayerParameters:
-    """A group's parameters: (networks, in, out) and (networks, 1, out); gradients are None where frozen.
+    """A group's parameters: (networks, in, out) and (networks, 1, out); gradients are None where frozen for good.
 
     The bias has a dimension of one for the batch, so that it is added to (networks, batch, out) as it is.
     """
@@ -31,7 +33,7 @@ class LayerParameters:
 
 
 class FlatParameters:
-    """Moves the parameters of linear layers into one vector, the trainable ones first.
+    """Moves the parameters of linear layers into one vector, in the order in which they begin to learn.
 
     The layers stay what they are: their weights become views into the vector (transposed ones, since a product reads
     (in, out)), so whoever reads or writes them reads or writes what is learned.
@@ -41,11 +43,14 @@ class FlatParameters:
         like: Parameters of the same groups, whose frozen layers count as frozen here; None: those that do not
             require gradients.
         reduced: For each group whether its products are computed in bfloat16, from a copy of its parameters.
+        thaws: Environment step at which layers begin to learn that do not require gradients now.
 
     Attributes:
+        begins: Environment step at which each group begins to learn: 0, that of its layers in ``thaws``, or infinite.
         values: All parameters.
-        trainable: The beginning of ``values`` that is learned.
+        trainable: The beginning of ``values`` that is learned, now or later.
         gradient: Gradient of ``trainable``, to be written to.
+        stages: By the step at which they begin to learn, ascending: their part of ``trainable``.
         masters: The groups' parameters and gradients, as views.
         blocks: The same as products read and write them: for reduced groups views of copies in bfloat16.
 
@@ -54,18 +59,23 @@ class FlatParameters:
     """
 
     def __init__(
-        self, groups: Sequence[Group], like: FlatParameters | None = None, reduced: Sequence[bool] = ()
+        self,
+        groups: Sequence[Group],
+        like: FlatParameters | None = None,
+        reduced: Sequence[bool] = (),
+        thaws: Mapping[nn.Module, int] | None = None,
     ) -> None:
-        self.frozen: list[bool] = [_is_frozen(group) for group in groups] if like is None else like.frozen
+        self.begins: list[float] = [_begin(group, thaws or {}) for group in groups] if like is None else like.begins
         reduced = reduced or [False] * len(groups)
         device, dtype = groups[0][0][0].weight.device, groups[0][0][0].weight.dtype
         sizes = [sum(_padded_sizes(group)) for group in groups]
-        # Frozen parameters lie behind the end of what the optimizer steps: not even their moments exist.
-        # What learns comes first, and of that what is reduced, so that one copy collects its gradients.
-        order = sorted(range(len(groups)), key=lambda index: (self.frozen[index], not reduced[index]))
+        # Frozen parameters lie behind the end of what the optimizer steps: not even their moments exist. What begins to
+        # learn at one step is one part, and begins with what is reduced, so that one copy collects its gradients.
+        order = sorted(range(len(groups)), key=lambda index: (self.begins[index], not reduced[index]))
         ends = torch.tensor([0, *(sizes[index] for index in order)]).cumsum(0).tolist()
         starts = dict(zip(order, ends, strict=False))
-        count = ends[sum(not frozen for frozen in self.frozen)]
+        count = ends[sum(begin < NEVER for begin in self.begins)]
+        self.stages = self._parts(sizes, [True] * len(groups)) or {0: slice(0, 0)}
         self.values = torch.zeros(ends[-1], device=device, dtype=dtype)
         self.trainable, self.gradient = self.values[:count], torch.zeros(count, device=device, dtype=dtype)
         self.masters = [self._block(group, starts[index], index) for index, group in enumerate(groups)]
@@ -76,7 +86,7 @@ class FlatParameters:
             # Adam's steps are far smaller than bfloat16 can tell from nothing beside a weight, so it steps float32
             # masters, and products read a copy that is made anew after each step.
             low_values, low_gradient = self._copies = self.values.bfloat16(), self.gradient.bfloat16()
-            self._collected = ends[sum(low and not frozen for low, frozen in zip(reduced, self.frozen, strict=True))]
+            self._collected = list(self._parts(sizes, reduced).values())
             self.blocks = [
                 self._block(group, starts[index], index, low_values, low_gradient) if low else self.masters[index]
                 for index, (group, low) in enumerate(zip(groups, reduced, strict=True))
@@ -90,7 +100,22 @@ class FlatParameters:
     def collect(self) -> None:
         """Brings gradients that reduced products have written to ``gradient``."""
         if self._copies:
-            self.gradient[: self._collected].copy_(self._copies[1][: self._collected])
+            for part in self._collected:
+                self.gradient[part].copy_(self._copies[1][part])
+
+    def learning(self, step: int) -> list[bool]:
+        """Whether each group learns at an environment step."""
+        return [begin <= step for begin in self.begins]
+
+    def _parts(self, sizes: Sequence[int], counted: Sequence[bool]) -> dict[float, slice]:
+        """Where the groups lie that begin to learn at one step, as far as they are counted; those come first there."""
+        parts, start = {}, 0
+        for begin in sorted(set(self.begins) - {NEVER}):
+            own = [index for index, other in enumerate(self.begins) if other == begin]
+            if length := sum(sizes[index] for index in own if counted[index]):
+                parts[begin] = slice(start, start + length)
+            start += sum(sizes[index] for index in own)
+        return parts
 
     def _block(self, group: Group, start: int, index: int, *vectors: Tensor) -> LayerParameters:
         networks, fan_in, fan_out = _shape(group)
@@ -103,58 +128,14 @@ class FlatParameters:
             return weight, bias
 
         values, gradient = vectors or (self.values, self.gradient)
-        return LayerParameters(*views(values), *((None, None) if self.frozen[index] else views(gradient)))
+        return LayerParameters(*views(values), *(views(gradient) if self.begins[index] < NEVER else (None, None)))
 
 
-class Adam:
-    """Adam (Kingma and Ba 2015) with PyTorch's defaults, on one vector.
-
-    Calls the kernel of ``torch.optim.Adam(fused=True)`` itself: the optimizer's bookkeeping around it takes longer
-    than a small network's step.
-
-    Args:
-        values: What it steps.
-        gradient: Gradient of ``values``, read at each step.
-        lr: Step size.
-    """
-
-    def __init__(self, values: Tensor, gradient: Tensor, lr: float) -> None:
-        self._mean, self._square = torch.zeros_like(values), torch.zeros_like(values)
-        self._steps, self._lr = torch.zeros((), device=values.device), lr
-        # The kernel takes lists of tensors; the empty one is that of AMSGrad.
-        self._lists: tuple[list[Tensor], ...] = (
-            [values], [gradient], [self._mean], [self._square], [], [self._steps],
-        )  # fmt: skip
-
-    @property
-    def updates(self) -> int:
-        """How many steps it has taken."""
-        return int(self._steps)
-
-    def step(self, share: float = 1.0) -> None:
-        """Takes one step down the gradient, of this share of its size."""
-        self._steps.add_(1)
-        torch._fused_adam_(
-            *self._lists,
-            lr=self._lr * share,
-            beta1=0.9,
-            beta2=0.999,
-            weight_decay=0.0,
-            eps=1e-8,
-            amsgrad=False,
-            maximize=False,
-        )
-
-    def tensors(self) -> dict[str, Tensor]:
-        """All that it remembers, to be copied from or into."""
-        return {"mean": self._mean, "square": self._square, "steps": self._steps}
-
-
-def _is_frozen(group: Group) -> bool:
-    learns = {parameter.requires_grad for layers in group for layer in layers for parameter in layer.parameters()}
-    if len(learns) > 1:
+def _begin(group: Group, thaws: Mapping[nn.Module, int]) -> float:
+    begins = {begin_of(layer, thaws) for layers in group for layer in layers}
+    if len(begins) > 1:
         raise ValueError("layers that work side by side (both critics', mean and log_std) must be frozen together")
-    return not learns.pop()
+    return begins.pop()
 
 
 def _shape(group: Group) -> tuple[int, int, int]:
