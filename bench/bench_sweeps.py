@@ -17,8 +17,7 @@ from pathlib import Path
 
 from acmr.storage.run_dir import RunDir
 from sweeps.folder import SweepFolder
-from sweeps.plan import Plan, expand, make_plan
-from sweeps.sweeper import entries_of
+from sweeps.plan import Plan, entries_of, expand, make_plan
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAN_LIMIT, STATUS_LIMIT, WORKERS_LIMIT = 60.0, 3.0, 0.55

@@ -15,25 +15,19 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from acmr.records import ENDED, FAILED, RUNNING, STOPPED, DamagedError
+from acmr.records import DamagedError
 from acmr.storage.durable import WriteError, read_regular
 from acmr.storage.json_files import write_json
 from acmr.storage.processes import is_alive
+from sweeps.state import STATES, State, SweepRun, read_run
 
 SWEEPS = ".sweeps"
 #: What a training printed, in its run's directory.
 OUTPUT_FILE = "output.log"
-#: State of a run of a sweep, beside those that it says itself.
-WAITING = "waiting"
-#: Fields of a run that are words, all others are numbers.
-_TEXTS = ("name", "cell", "directory", "ended")
-_STATES = (WAITING, RUNNING, STOPPED, *ENDED, FAILED)
-#: States that a run does not leave within its sweep.
-FINAL = (*ENDED, FAILED)
 #: Folders of former sweeps that are kept.
 _KEPT = 10
 _PLAN, _SET_ASIDE = "plan.json", "plan.json.damaged"
@@ -43,48 +37,6 @@ _MOST_BYTES = 64 << 20
 _KINDS: dict[str, Any] = {
     "command": str, "retries": int, "grace": int | float, "process": int, "host": str, "order": list, "runs": list,
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class SweepRun:
-    """One run, as the sweep's folder knows it.
-
-    Attributes:
-        index: Its place in the plan.
-        name: The run's name.
-        cell: The paper's name of the experiment, if it has one.
-        seed: Its seed.
-        directory: Where it lies, from the folder of all runs.
-        total_timesteps: Steps that it takes at most.
-        threads: Threads that it uses.
-        teacher: Index of the run that has to be complete before it starts.
-        ended: ``complete`` or ``diverged``, if it was there before the sweep.
-    """
-
-    index: int
-    name: str
-    cell: str | None
-    seed: int
-    directory: str
-    total_timesteps: int
-    threads: int
-    teacher: int | None
-    ended: str | None
-
-
-@dataclass(frozen=True)
-class State:
-    """What has become of a run within its sweep.
-
-    Attributes:
-        state: ``waiting``, ``running``, ``complete``, ``diverged``, ``failed`` or ``stopped``.
-        failures: How often it failed.
-        reason: Why it failed or waits, in one line.
-    """
-
-    state: str = WAITING
-    failures: int = 0
-    reason: str = ""
 
 
 class SweepFolder:
@@ -150,7 +102,7 @@ class SweepFolder:
         Raises:
             DamagedError: If the plan cannot be read, or has something else in their place.
         """
-        return [_entry(self.path / _PLAN, index, run) for index, run in enumerate(self.header()["runs"])]
+        return [read_run(self.path / _PLAN, index, run) for index, run in enumerate(self.header()["runs"])]
 
     def is_alive(self) -> bool:
         """Whether its process is still there."""
@@ -196,7 +148,7 @@ class SweepFolder:
         with suppress(DamagedError):
             said = _read(self._state_file(index))
             state, failures, reason = said.get("state"), said.get("failures"), said.get("reason")
-            if state in _STATES and type(failures) is int and 0 <= failures < 1_000_000 and isinstance(reason, str):
+            if state in STATES and type(failures) is int and 0 <= failures < 1_000_000 and isinstance(reason, str):
                 return State(state, failures, reason)
         return State()
 
@@ -270,20 +222,6 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise DamagedError(f"{path}: cannot be read")
     return content
-
-
-def _entry(path: Path, index: int, run: Any) -> SweepRun:
-    """A run of a plan, every field of its type; runs lie within the folder of all runs."""
-    with suppress(TypeError, ValueError):
-        entry = SweepRun(**run)
-        values = {**asdict(entry), "teacher": entry.teacher or 0, "cell": entry.cell or "", "ended": entry.ended or ""}
-        typed = all(type(value) is (str if key in _TEXTS else int) for key, value in values.items())
-        if typed and min(entry.index, entry.seed, entry.threads, values["teacher"]) >= 0:
-            place = Path(entry.directory)
-            inside = len(place.parts) > 1 and not place.is_absolute() and not {"..", "\0"} & {*place.parts, *str(place)}
-            if inside and (entry.teacher is None or entry.teacher < index):
-                return entry
-    raise DamagedError(f"{path}: no plan of a sweep (run {index})")
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -14,6 +15,7 @@ from acmr.settings.compose import compose_config, parse
 from acmr.settings.errors import check_booleans
 from acmr.settings.run_spec import RunSpec, specify, teacher_spec
 from acmr.storage.run_dir import RunDir, holds_run
+from sweeps.state import SweepRun
 
 #: Settings that a teacher takes over from its student because they change nothing in its result.
 _SHARED_KEYS = ("device", "threads", "progress", "log_every", "tracking", "checkpoint_every", "resume")
@@ -145,6 +147,24 @@ def make_plan(specs: Sequence[RunSpec]) -> Plan:
             )
         )
     return Plan(tuple(runs))
+
+
+def entries_of(plan: Plan, output_dir: Path) -> list[SweepRun]:
+    """The runs of a plan as its sweep's folder keeps them."""
+    return [
+        SweepRun(
+            index=run.index,
+            name=run.spec.name,
+            cell=run.spec.cell,
+            seed=run.spec.config.seed,
+            directory=os.path.relpath(run.spec.directory, output_dir),
+            total_timesteps=run.spec.config.most_steps,
+            threads=run.spec.config.threads,
+            teacher=run.teacher,
+            ended=run.ended,
+        )
+        for run in plan.runs
+    ]
 
 
 def _stand_ins(specs: Sequence[RunSpec]) -> dict[Path, RunSpec]:

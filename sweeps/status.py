@@ -19,8 +19,9 @@ from acmr.names import terminal
 from acmr.records import CONFIG_FILE, FAILED, RUNNING, SEED_FOLDER, STATUS_FILE
 from acmr.run_folders import RunFolder, run_folders
 from acmr.text import duration
-from sweeps.folder import WAITING, State, SweepFolder, SweepRun, all_folders
-from sweeps.table import counts, make_console, one_screen, reasons, run_table
+from sweeps.folder import SweepFolder, all_folders
+from sweeps.screen.table import counts, make_console, one_screen, reasons, run_table
+from sweeps.state import WAITING, State, SweepRun
 from sweeps.view import BLOCKED, LOST, RunStatus, steps_ahead, view_entries, view_run
 
 #: States for which somebody has to do something.

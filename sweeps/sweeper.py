@@ -21,13 +21,14 @@ from acmr.settings.compose import CONFIG_FOLDER, look_in, sources
 from acmr.settings.sources import sources_of
 from acmr.storage.durable import WriteError
 from acmr.text import one_line
-from sweeps.display import Display, command_line, print_plan
 from sweeps.estimate import estimate
-from sweeps.folder import FINAL, State, SweepFolder, SweepRun, all_folders
+from sweeps.folder import SweepFolder, all_folders
 from sweeps.job import STOP_SIGNALS, write_job
 from sweeps.launchers.base import LauncherAdapter, make_adapter
 from sweeps.launchers.launch import Launch
-from sweeps.plan import Plan, expand, make_plan
+from sweeps.plan import Plan, entries_of, expand, make_plan
+from sweeps.screen.display import Display, command_line, print_plan
+from sweeps.state import FINAL, State
 
 #: Seconds between two looks at the jobs; seconds that workers have to end after the trainings had theirs.
 _GLANCE, _MARGIN = 0.5, 10.0
@@ -227,24 +228,6 @@ class Sweep:
 
     def _command(self) -> str:
         return self._typed
-
-
-def entries_of(plan: Plan, output_dir: Path) -> list[SweepRun]:
-    """The runs of a plan as its sweep's folder keeps them."""
-    return [
-        SweepRun(
-            index=run.index,
-            name=run.spec.name,
-            cell=run.spec.cell,
-            seed=run.spec.config.seed,
-            directory=os.path.relpath(run.spec.directory, output_dir),
-            total_timesteps=run.spec.config.most_steps,
-            threads=run.spec.config.threads,
-            teacher=run.teacher,
-            ended=run.ended,
-        )
-        for run in plan.runs
-    ]
 
 
 def _check(settings: Settings) -> None:

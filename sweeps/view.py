@@ -25,7 +25,7 @@ from acmr.records import (
 from acmr.run_folders import changes
 from acmr.storage.json_files import read_json
 from acmr.storage.processes import is_alive
-from sweeps.folder import FINAL, WAITING, State, SweepRun
+from sweeps.state import FINAL, WAITING, State, SweepRun
 
 #: A run that says it is running, but whose process is gone or has said nothing for so many seconds.
 LOST, SILENCE = "lost", 600.0

@@ -21,8 +21,9 @@ from acmr.command import command
 from acmr.config import ConfigError
 from acmr.records import COMPLETE, ENDED, FAILED, RUNNING, STOPPED, DamagedError
 from acmr.storage.run_dir import RunDir
-from sweeps.folder import FINAL, OUTPUT_FILE, State, SweepFolder, SweepRun
+from sweeps.folder import OUTPUT_FILE, SweepFolder
 from sweeps.job import STOP_SIGNALS, TrainingProcess
+from sweeps.state import FINAL, State, SweepRun
 
 #: The run that a job takes up where it may choose.
 NEXT = "next"

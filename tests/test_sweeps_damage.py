@@ -13,8 +13,9 @@ from test_sweeps_run import complete, run
 from test_sweeps_status import entry, heartbeat, sweep
 
 from acmr.config import ConfigError
-from sweeps.folder import State, SweepFolder, all_folders
+from sweeps.folder import SweepFolder, all_folders
 from sweeps.job import adopt
+from sweeps.state import State
 from sweeps.status import main
 from sweeps.worker import Worker
 

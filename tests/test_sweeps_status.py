@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from acmr.records import FAILED, RUNNING, STOPPED
-from sweeps.folder import State, SweepFolder, SweepRun, all_folders
+from sweeps.folder import SweepFolder, all_folders
+from sweeps.screen.table import counts
+from sweeps.state import State, SweepRun
 from sweeps.status import main
-from sweeps.table import counts
 from sweeps.view import view_entries, view_run
 
 CONF = Path(__file__).resolve().parent.parent / "conf"

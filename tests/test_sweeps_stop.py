@@ -14,13 +14,12 @@ from acmr.records import RUNNING
 from acmr.settings.compose import compose_config, parse
 from acmr.settings.run_spec import RunSpec, specify
 from acmr.storage.run_dir import RunDir
-from sweeps.display import print_plan
 from sweeps.estimate import estimate
-from sweeps.folder import WAITING
-from sweeps.plan import Plan, expand, make_plan
+from sweeps.plan import Plan, entries_of, expand, make_plan
+from sweeps.screen.display import print_plan
+from sweeps.screen.table import run_table
+from sweeps.state import WAITING
 from sweeps.status import main
-from sweeps.sweeper import entries_of
-from sweeps.table import run_table
 from sweeps.view import Lengths, RunStatus, steps_ahead, view_run
 
 PUBLISHED = Path(__file__).resolve().parent.parent / "results" / "paper"

@@ -21,8 +21,8 @@ from test_sweeps_status import ended, heartbeat
 
 from acmr.records import COMPLETE, FAILED, RUNNING
 from acmr.text import shorten
-from sweeps.folder import WAITING
-from sweeps.table import reasons, run_table
+from sweeps.screen.table import reasons, run_table
+from sweeps.state import WAITING
 from sweeps.view import BLOCKED, LOST, RunStatus
 
 RATES = [f"ant_three_legs-none-hidden_sizes=16+16-q_lr={rate}-total_timesteps=1000000" for rate in ("1e-05", "0.0003")]

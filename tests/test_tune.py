@@ -158,7 +158,7 @@ def test_it_finds_what_is_best_and_cuts_short_what_is_not(tmp_path, capsys):
 
 
 def test_the_command_that_goes_on_is_the_one_that_was_typed(monkeypatch):
-    from sweeps.display import command_line
+    from sweeps.screen.display import command_line
 
     monkeypatch.setattr(sys, "argv", ["/somewhere/acmr/app/tune/__main__.py", "-m", "hydra/sweeper=tune", RATE])
     monkeypatch.setattr(sys, "orig_argv", ["python3", "/venv/bin/acmr", "tune", RATE])

@@ -29,8 +29,8 @@ from acmr.settings.compose import CONFIG_FOLDER, compose_config, look_in, parse
 from acmr.settings.run_spec import specify
 from acmr.settings.sources import sources_of
 from acmr.storage.hold import hold
-from sweeps.display import command_line
 from sweeps.launchers.base import make_adapter
+from sweeps.screen.display import command_line
 from sweeps.sweeper import Settings
 
 #: Folder of all searches, in that of all runs; the files of one: Optuna's own, and what the sweeps said.

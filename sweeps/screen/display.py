@@ -18,9 +18,10 @@ from acmr.names import terminal
 from acmr.records import COMPLETE, DIVERGED, ENDED, FAILED, RUNNING, STOPPED
 from acmr.text import duration, size
 from sweeps.estimate import Estimate
-from sweeps.folder import FINAL, OUTPUT_FILE, SweepFolder, SweepRun
+from sweeps.folder import OUTPUT_FILE, SweepFolder
 from sweeps.plan import Plan, PlannedRun
-from sweeps.table import counts, make_console, one_screen
+from sweeps.screen.table import counts, make_console, one_screen
+from sweeps.state import FINAL, SweepRun
 from sweeps.view import BLOCKED, LOST, RunStatus, steps_ahead, view_entries
 
 #: Seconds between two plain lines on how far everything is.

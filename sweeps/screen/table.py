@@ -13,7 +13,7 @@ from acmr.cells import stops
 from acmr.names import terminal
 from acmr.records import COMPLETE, DIVERGED, FAILED, RUNNING, STOPPED
 from acmr.text import UNLIMITED, duration, shorten
-from sweeps.folder import WAITING
+from sweeps.state import WAITING
 from sweeps.view import BLOCKED, LOST, RunStatus
 
 #: Lines on why runs are in their states, and rows of runs, that a table has where the terminal is low.
