@@ -42,7 +42,9 @@ PRECISIONS = ("float32", "bfloat16")
 #: Who acts before learning starts.
 RANDOM, POLICY = "random", "policy"
 EXACT, INEXACT = "exact", "inexact"
-ACTIVATIONS = ("relu", "none")
+RELU, NO_ACTIVATION = ACTIVATIONS = ("relu", "none")
+#: How adapters begin: ``random``, or as the selection of sensors and actuators by their names.
+NAMES = "names"
 #: What a sensor or an actuator that is gone counts as in the networks that knew it (``transfer=named``).
 MEAN, ZERO, INITIAL, AUTO = "mean", "zero", "initial", "auto"
 IMPUTATIONS = (AUTO, MEAN, ZERO, INITIAL)
@@ -176,7 +178,9 @@ class TransferConfig:
     #: Teachers that students take in turn, unless a path names one: seed s that of seed (s - 1) mod so many + 1.
     teacher_seeds: int | None = None
     #: Activation between the new input adapter and the teacher's first layer (``expand`` only).
-    adapter_activation: str = "relu"
+    adapter_activation: str = RELU
+    #: How its adapters begin: ``random``, or with each sensor and actuator as what the teacher calls so (``names``).
+    adapter_init: str = RANDOM
     #: Start from the teacher's temperature instead of log_alpha = 0.
     copy_log_alpha: bool = False
     #: What the student calls otherwise, as ``old:new``; typed ``transfer.rename={old: new}`` (``named`` only).

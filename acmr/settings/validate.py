@@ -15,10 +15,12 @@ from acmr.config import (
     IMPUTATIONS,
     INEXACT,
     METRICS,
+    NAMES,
     POLICY,
     PRECISIONS,
     PROGRESS_MODES,
     RANDOM,
+    RELU,
     SEEDINGS,
     STEPS,
     THRESHOLD,
@@ -92,6 +94,7 @@ def validate(config: ExperimentConfig) -> None:
     _one_of("resume", config.resume, (EXACT, INEXACT))
     _one_of("metric", config.metric, METRICS)
     _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
+    _one_of("transfer.adapter_init", config.transfer.adapter_init, (RANDOM, NAMES))
     _check_impute(config.transfer.impute)
     check_address("tracking.base_url", config.tracking.base_url)
     for key, value in flatten(asdict(config)).items():
@@ -180,6 +183,11 @@ def _check_transfer(config: ExperimentConfig) -> None:
         raise ConfigError(
             f"{name} agent.kickstart={config.agent.kickstart:g}: without a transfer there is no policy to hold on to; "
             f"leave it out{rules.or_instead}"
+        )
+    if transfer.adapter_init == NAMES and transfer.adapter_activation == RELU:
+        raise ConfigError(
+            f"transfer.adapter_init={NAMES} transfer.adapter_activation={RELU}: the ReLU would cut off whatever is "
+            "below zero, so that the teacher's layers would not see its sensors; type transfer.adapter_activation=none"
         )
     if config.freeze and not rules.freezable:
         why = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acmr.agent.architecture import Dimensions
-from acmr.config import ZERO, ConfigError, ExperimentConfig
+from acmr.config import NAMES, ZERO, ConfigError, ExperimentConfig
 from acmr.envs import describe
 from acmr.settings.run_spec import specify, teacher_spec
 from acmr.storage.run_dir import RunDir
@@ -25,8 +25,8 @@ def find_teacher(config: ExperimentConfig, dims: Dimensions) -> Teacher | None:
     if not config.transfer.rules.needs_teacher:
         return None
     teacher = load_teacher(config.transfer.teacher) if config.transfer.teacher is not None else _implied(config, dims)
-    asked_for = config.transfer.rules.statistics and config.transfer.impute != ZERO
-    return with_statistics(teacher) if asked_for else teacher
+    stands_in = config.transfer.rules.statistics or config.transfer.adapter_init == NAMES
+    return with_statistics(teacher) if stands_in and config.transfer.impute != ZERO else teacher
 
 
 def _implied(config: ExperimentConfig, dims: Dimensions) -> Teacher:

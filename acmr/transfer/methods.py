@@ -13,10 +13,10 @@ from typing import Any
 
 import torch
 
-from acmr.agent.architecture import Dimensions, is_hidden
+from acmr.agent.architecture import Dimensions, is_adapter, is_hidden
 from acmr.agent.fine_tuning import thaw_schedule
 from acmr.agent.networks import Networks
-from acmr.config import ConfigError, TransferConfig
+from acmr.config import NAMES, NO_ACTIVATION, ConfigError, TransferConfig
 from acmr.registry import Registry, named_in
 from acmr.transfer.audition import Audition, Biases
 from acmr.transfer.report import TransferReport, report_transfer
@@ -126,6 +126,11 @@ def transfer(
     taken = take(student, teacher, config, generator)
     if teacher is not None and not (taken.copied or taken.fitted):
         raise ConfigError(f"transfer={config.name}: no layer of {teacher.path} could be copied")
+    if config.adapter_init == NAMES and not any(map(is_adapter, taken.fitted)):
+        raise ConfigError(
+            f"transfer={config.name} transfer.adapter_init={NAMES}: this method makes no adapters; leave it out"
+            f"{config.rules.or_instead}"
+        )
     taken = _bound_alike(taken, teacher)
     layers = taken.networks.layers()
     frozen = [name for name in layers if freeze and name in taken.copied]
@@ -180,15 +185,32 @@ def hidden(student: Student, teacher: Teacher, config: TransferConfig, generator
 
 @method("expand")
 def expand(student: Student, teacher: Teacher, config: TransferConfig, generator: torch.Generator) -> Taken:
-    """All layers in the teacher's dimensions, between adapters to the student's (A3, A4)."""
+    """All layers in the teacher's dimensions, between adapters to the student's (A3, A4).
+
+    With ``transfer.adapter_init=names`` the adapters begin as a selection, so that the student begins with the same
+    function as one by name; and they learn, whatever is frozen.
+    """
     if teacher.description.core is not None:
         raise ConfigError(
             f"transfer=expand: the teacher {teacher.path} is itself expanded, and adapters are not stacked; "
             f"give the teacher it came from{config.rules.or_instead}"
         )
+    if config.adapter_init == NAMES:
+        # What fits an expanded teacher's adapters by name fits these: they select all there is.
+        return find_method(TransferConfig(name="named"))(student, _all_selected(teacher), config, generator)
     networks = student.networks.with_core(teacher.description.dims, config.adapter_activation, generator)
     inner = [name for name in networks.layers() if f"{name}.weight" in teacher.tensors]
     return Taken(networks, copy_layers(networks, teacher, inner))
+
+
+def _all_selected(teacher: Teacher) -> Teacher:
+    """The same function as one that was expanded into its own body: adapters that hand on what they read."""
+    about, tensors = teacher.description, dict(teacher.tensors)
+    core = replace(about, core=[about.dims.observation, about.dims.action], adapter_activation=NO_ACTIVATION)
+    for name, shape in core.architecture.tensors.items():
+        if name not in tensors:
+            tensors[name] = torch.eye(*shape) if name.endswith("weight") else torch.zeros(shape)
+    return replace(teacher, description=core, tensors=tensors)
 
 
 def check_body(config: TransferConfig, owner: str, theirs: Dimensions, ours: Dimensions) -> None:
