@@ -86,6 +86,8 @@ class EnvConfig:
     drop_actuators: list[int | str] = field(default_factory=list)
     #: Steps an episode may take; None: as registered with Gymnasium.
     max_episode_steps: int | None = None
+    #: What is put around it, the first innermost: Gymnasium's wrappers, or ``module:Name``, and their arguments.
+    wrappers: list[dict[str, Any]] = field(default_factory=list)
 
 
 @dataclass

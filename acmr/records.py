@@ -64,6 +64,8 @@ VELOCITY_COLUMN = "mean_forward_velocity"
 METRIC_COLUMNS = ("global_step", "steps_per_second")
 #: What an environment's ``info`` calls its forward velocity, in m/s.
 VELOCITY_KEY = "x_velocity"
+#: Where ``info`` holds the reward of the environment itself, if wrappers around it may have changed it.
+RAW_REWARD_KEY = "acmr_raw_reward"
 #: How the names of the terms of the reward begin in an environment's ``info``.
 REWARD_PREFIX = "reward_"
 
@@ -198,7 +200,8 @@ class EpisodeInProgress:
     def step(self, reward: float, info: Mapping[str, Any]) -> None:
         """Adds one environment step; a term that ``info`` does not hold at this step adds nothing."""
         self.length += 1
-        self.total += reward
+        # Returns and thresholds are of what the environment pays, whatever the learner is told.
+        self.total += info.get(RAW_REWARD_KEY, reward)
         if self.velocity and VELOCITY_KEY in info:
             self.distance += float(info[VELOCITY_KEY])
             self.reports += 1

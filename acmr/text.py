@@ -39,6 +39,11 @@ def _said(value: object, how: Callable[[object], str]) -> str:
         return ""
 
 
+def typed_mapping(settings: Mapping[str, Any]) -> str:
+    """Some settings as they are typed: ``{name:FrameStackObservation,stack_size:3}``."""
+    return "{" + ",".join(f"{key}:{value}" for key, value in settings.items()) + "}"
+
+
 def holds_userinfo(value: object) -> bool:
     """Whether a value holds an address with a user or a password, ``http://user:password@host``."""
     if isinstance(value, Mapping):

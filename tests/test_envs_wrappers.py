@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs import describe, make_env
-from acmr.envs.wrappers import PartialEnv, kept_rows
+from acmr.envs.wrappers.partial import PartialEnv, kept_rows
 from acmr.settings.compose import environment_config
 
 ANT = environment_config("ant")

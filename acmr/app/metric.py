@@ -50,7 +50,8 @@ def metric_line(config: ExperimentConfig, summary: Mapping[str, Any], value: flo
 
 
 def _evaluated(spec: RunSpec) -> float:
-    actor = load_teacher(spec.directory).build_networks().actor.eval()
-    played = play(actor, spec.config.env, episodes=EPISODES, seed=0, stochastic=False)
+    teacher = load_teacher(spec.directory)
+    actor, wrappers = teacher.build_networks().actor.eval(), teacher.wrapper_states()
+    played = play(actor, spec.config.env, wrappers, episodes=EPISODES, seed=0, stochastic=False)
     returns = [episode.episodic_return for episode in played]
     return sum(returns) / len(returns)

@@ -11,6 +11,7 @@ import torch
 from gymnasium.spaces import Box
 
 from acmr.envs import make_env
+from acmr.envs.wrappers.memory import give_lasting
 from acmr.evaluation.evaluate import load_policy, load_run
 from acmr.storage.run_dir import RunDir
 from acmr.transfer.description import TeacherDescription
@@ -88,7 +89,9 @@ class Policy:
         return found if given.ndim == 2 else found[0]
 
     def environment(self, trust: bool = False) -> gym.Env[np.ndarray, np.ndarray]:
-        """A new copy of the environment that it learned in, with the sensors and actuators that it knows.
+        """A new copy of the environment that it learned in, with the sensors, actuators and wrappers that it knows.
+
+        Running statistics of its wrappers are those of the end of the training, and stay so.
 
         Args:
             trust: Whether the run's own files may choose code to run (docs/security.md).
@@ -96,7 +99,11 @@ class Policy:
         Raises:
             ConfigError: If it cannot be made, or would run code that only these files choose.
         """
-        return make_env(load_run(self._path, trust)[1])
+        teacher, config = load_run(self._path, trust)
+        env = make_env(config)
+        # As in an evaluation: what was seen in training is what the policy's numbers are relative to.
+        give_lasting(env, teacher.wrapper_states(), settled=True)
+        return env
 
     def __repr__(self) -> str:
         return (

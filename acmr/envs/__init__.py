@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
@@ -21,8 +21,11 @@ from acmr.envs.construct import cannot_run, construct
 from acmr.envs.conversion import ConvertedEnv, FaultyEnvironmentError
 from acmr.envs.naming import part_names, probe
 from acmr.envs.state import ResumeCheck, time_limits, try_resume
-from acmr.envs.wrappers import PartialEnv, kept_rows
+from acmr.envs.wrappers.carried import carried_names, normalized_names
+from acmr.envs.wrappers.memory import give_lasting
+from acmr.envs.wrappers.partial import PartialEnv, kept_rows
 from acmr.records import REWARD_PREFIX, VELOCITY_KEY
+from acmr.stateful import State
 
 __all__ = ["EnvDescription", "check_resume", "describe", "make_env"]
 
@@ -42,6 +45,7 @@ class EnvDescription:
         has_forward_velocity: Whether ``info`` holds ``x_velocity``, in m/s.
         model_hash: SHA-256 (hex) of the compiled MuJoCo model, or of the registration where there is no model.
         parts: What the observation is made of, as in ``Dict``, where it is not one array; else None.
+        normalized: Names of what each chosen wrapper normalizes by running statistics, by the wrapper's name.
     """
 
     observation_names: tuple[str, ...]
@@ -54,6 +58,7 @@ class EnvDescription:
     has_forward_velocity: bool
     model_hash: str
     parts: str | None = None
+    normalized: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def remarks(self, name: str) -> list[str]:
         """What somebody who trains in it should know at once, in lines.
@@ -78,7 +83,9 @@ class EnvDescription:
 _tried_out: dict[str, EnvDescription] = {}
 
 
-def make_env(config: EnvConfig, render_mode: str | None = None) -> gym.Env[np.ndarray, np.ndarray]:
+def make_env(
+    config: EnvConfig, render_mode: str | None = None, wrappers: State | None = None
+) -> gym.Env[np.ndarray, np.ndarray]:
     """Makes an environment with one-dimensional Box spaces and its time limit.
 
     Observations or actions of several dimensions, and observations that are made of parts, are flattened. What it takes
@@ -87,11 +94,14 @@ def make_env(config: EnvConfig, render_mode: str | None = None) -> gym.Env[np.nd
     Args:
         config: The environment's settings.
         render_mode: As in Gymnasium (``rgb_array``, ``human``); None: not rendered.
+        wrappers: What the wrappers around it remember already (:mod:`acmr.envs.wrappers.memory`).
 
     Raises:
         ConfigError: With one line that says what is wrong with the settings.
     """
-    return _with_kept(config, _try_out(config), construct(config, render_mode))
+    env = _with_kept(config, _try_out(config), construct(config, render_mode))
+    give_lasting(env, wrappers or {}, settled=False)
+    return env
 
 
 def _with_kept(config: EnvConfig, whole: EnvDescription, env: gym.Env[Any, Any]) -> gym.Env[np.ndarray, np.ndarray]:
@@ -149,7 +159,7 @@ def _tried(config: EnvConfig) -> tuple[EnvDescription, ConvertedEnv]:
     """An instance that has been tried out, and what was seen of it."""
     env = construct(config)
     try:
-        whole = _tried_out[_key(config)] = _look_at(env)
+        whole = _tried_out[_key(config)] = _look_at(env, config)
     except Exception as error:
         env.close()
         raise cannot_run(config, error) from error
@@ -158,16 +168,22 @@ def _tried(config: EnvConfig) -> tuple[EnvDescription, ConvertedEnv]:
 
 def _key(config: EnvConfig) -> str:
     # Not the name, the teacher and what is dropped: none of them changes what is constructed.
-    made_from = (config.id, config.kwargs, config.remove_bodies, config.max_episode_steps)
+    made_from = (config.id, config.kwargs, config.remove_bodies, config.max_episode_steps, config.wrappers)
     return json.dumps(made_from, sort_keys=True, default=repr)
 
 
-def _look_at(env: ConvertedEnv) -> EnvDescription:
+def _look_at(env: ConvertedEnv, config: EnvConfig) -> EnvDescription:
     seen, actions, model = probe(env), env.action_space, getattr(env.unwrapped, "model", None)
     assert isinstance(actions, Box)
+    names, normalized = (seen.observation_names, seen.action_names), {}
+    if config.wrappers:
+        # What the simulation shows is what lies within them.
+        bare = _try_out(replace(config, wrappers=[]))
+        names = carried_names(env.env, bare.observation_names, bare.action_names)
+        normalized = normalized_names(env.env, bare.observation_names)
     return EnvDescription(
-        observation_names=seen.observation_names,
-        action_names=seen.action_names,
+        observation_names=names[0],
+        action_names=names[1],
         action_low=tuple(actions.low.ravel().tolist()),
         action_high=tuple(actions.high.ravel().tolist()),
         max_episode_steps=min(time_limits(env), default=None),
@@ -176,6 +192,7 @@ def _look_at(env: ConvertedEnv) -> EnvDescription:
         has_forward_velocity=VELOCITY_KEY in seen.info_keys,
         model_hash=_hash(env),
         parts=None if env.observation_names is None else type(env.env.observation_space).__name__,
+        normalized=normalized,
     )
 
 

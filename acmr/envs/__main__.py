@@ -10,7 +10,7 @@ from acmr.command import add_own_modules, command, typed
 from acmr.config import ConfigError, EnvConfig
 from acmr.envs import describe
 from acmr.envs.construct import find_spec, gym_ids
-from acmr.envs.wrappers import near_matches
+from acmr.envs.wrappers.partial import near_matches
 from acmr.names import terminal
 from acmr.settings.command_line import use_folder
 from acmr.settings.compose import environment_config, options

@@ -23,15 +23,17 @@ from acmr.config import ConfigError, EnvConfig
 from acmr.envs.bodies import without_bodies
 from acmr.envs.conversion import ConvertedEnv, FaultyEnvironmentError, place_of
 from acmr.envs.spaces import is_empty, is_usable
-from acmr.envs.wrappers import near_matches
-from acmr.text import brief, one_line
+from acmr.envs.wrappers.chosen import wrapped
+from acmr.envs.wrappers.partial import near_matches
+from acmr.text import brief, one_line, typed_mapping
 
-#: What MuJoCo says of Gymnasium's own model files, of no use to who runs them.
+#: What MuJoCo says of Gymnasium's own model files, and Gymnasium of its own wrappers, of no use to who runs them.
 _MODEL_REMARK = r"compiler attribute .* is deprecated"
 #: What dm_control says where there is no screen, of no use to who trains.
 _SCREEN_REMARK = r".*The DISPLAY environment variable is missing"
 #: The package of DeepMind's environments, and which one registers them with Gymnasium.
 _DM_CONTROL, _SHIMMY = "dm_control", "shimmy"
+_SPACE_REMARK = r".*precision lowered by casting"
 
 
 def find_spec(env_id: str) -> EnvSpec:
@@ -102,6 +104,7 @@ def construct(config: EnvConfig, render_mode: str | None = None) -> ConvertedEnv
             raise
         except BaseException as error:
             raise ConfigError(_reason(config, creator, error)) from error
+        env = wrapped(env, config.wrappers)
     _check_spaces(config.id, env)
     return ConvertedEnv(env, config.id)
 
@@ -113,6 +116,8 @@ def cannot_run(config: EnvConfig, error: BaseException) -> ConfigError:
         given.append(f"env.kwargs={config.kwargs}")
     if config.remove_bodies:
         given.append(f"env.remove_bodies=[{','.join(config.remove_bodies)}]")
+    if config.wrappers:
+        given.append(f"env.wrappers=[{','.join(map(typed_mapping, config.wrappers))}]")
     # What a missing body, site or joint looks like in the environment's own code.
     needed = config.remove_bodies and isinstance(error.__cause__ or error, LookupError)
     why = "its own code needs a part that is gone" if needed else "this environment cannot run"
@@ -136,6 +141,7 @@ def _quiet_models() -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", _MODEL_REMARK)
             warnings.filterwarnings("ignore", _SCREEN_REMARK)
+            warnings.filterwarnings("ignore", _SPACE_REMARK)
             yield
     finally:
         mujoco.set_mju_user_warning(before)

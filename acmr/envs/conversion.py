@@ -18,7 +18,8 @@ from gymnasium.spaces import Box
 
 from acmr.config import ConfigError
 from acmr.envs.spaces import flat_space, flattened, names_of, to_array
-from acmr.records import REWARD_PREFIX, VELOCITY_KEY
+from acmr.envs.wrappers.chosen import own_reward
+from acmr.records import RAW_REWARD_KEY, REWARD_PREFIX, VELOCITY_KEY
 from acmr.text import brief, one_line
 
 #: An error is shown where the environment's own code is: not in wrappers, unless they are its own, ...
@@ -68,6 +69,7 @@ class ConvertedEnv(gym.Wrapper[np.ndarray, np.ndarray, Any, Any]):
         box = given if isinstance(given, Box) else flat_space(given)
         self.observation_names = None if isinstance(given, Box) else names_of(given)
         self.observation_space, self._shape, self._dtype = box, box.shape, box.dtype
+        self._raw = own_reward(env)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -91,7 +93,7 @@ class ConvertedEnv(gym.Wrapper[np.ndarray, np.ndarray, Any, Any]):
         Returns:
             A copy of the observation in the space's shape and dtype, the reward, whether the episode was terminated
             and truncated, and info; there the terms of the reward and the velocity are floats where they are numbers,
-            and are left out where they are not.
+            and are left out where they are not. Where wrappers were chosen, it holds the reward from within them, too.
 
         Raises:
             FaultyEnvironmentError: As :meth:`reset`.
@@ -107,12 +109,15 @@ class ConvertedEnv(gym.Wrapper[np.ndarray, np.ndarray, Any, Any]):
             raise
         except BaseException as error:
             raise self._raised("step", error) from error
+        info = self._info(info)
+        if self._raw is not None:
+            info[RAW_REWARD_KEY] = sum(map(self._reward, self._raw.take()))
         return (
             self._observation(observation),
             self._reward(reward),
             self._flag("terminated", terminated),
             self._flag("truncated", truncated),
-            self._info(info),
+            info,
         )
 
     def close(self) -> None:

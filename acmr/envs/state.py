@@ -18,7 +18,9 @@ from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.wrappers import TimeLimit
 
 from acmr.envs.conversion import ConvertedEnv, number
-from acmr.envs.wrappers import PartialEnv
+from acmr.envs.wrappers.chosen import OwnReward
+from acmr.envs.wrappers.memory import has_memory, remember, remembered
+from acmr.envs.wrappers.partial import PartialEnv
 from acmr.stateful import State, Stateful
 
 ANYTIME, BETWEEN_EPISODES, NEVER = "anytime", "between episodes", "never"
@@ -26,7 +28,7 @@ ANYTIME, BETWEEN_EPISODES, NEVER = "anytime", "between episodes", "never"
 _BEFORE, _AFTER = 25, 25
 _INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 #: Wrappers that remember nothing from one step to the next.
-_STATELESS = (PartialEnv,)
+_STATELESS = (PartialEnv, OwnReward)
 
 Env = gym.Env[Any, Any]
 
@@ -65,6 +67,7 @@ def capture(env: Env, whole: bool) -> State:
     state: State = {"random": bare.np_random.bit_generator.state}
     # Either way: only the layer itself knows what of it outlives a reset.
     state["layers"] = {name: layer.state_dict() for name, layer in layers.items() if isinstance(layer, Stateful)}
+    state["layers"] |= {name: remembered(layer) for name, layer in layers.items() if _is_gymnasium_s(layer)}
     if whole:
         state["elapsed_steps"] = {name: limit._elapsed_steps for name, limit in _time_limits(layers)}
         if isinstance(bare, MujocoEnv):
@@ -87,6 +90,8 @@ def restore(env: Env, state: State) -> None:
     for name, layer in layers.items():
         if isinstance(layer, Stateful):
             layer.load_state_dict(state["layers"][name])
+        elif _is_gymnasium_s(layer):
+            remember(layer, state["layers"][name])
     if whole:
         for name, limit in _time_limits(layers):
             limit._elapsed_steps = state["elapsed_steps"][name]
@@ -107,6 +112,10 @@ def _layers(env: Env) -> dict[str, Env]:
     # The conversion has no state; counting it would rename all that lies within.
     found = [layer for layer in found if not isinstance(layer, ConvertedEnv)]
     return {f"{depth}_{type(layer).__name__}": layer for depth, layer in enumerate(found)}
+
+
+def _is_gymnasium_s(layer: Env) -> bool:
+    return has_memory(layer) and not isinstance(layer, Stateful)
 
 
 def _time_limits(layers: Mapping[str, Env]) -> list[tuple[str, TimeLimit]]:
@@ -204,7 +213,10 @@ def try_resume(make: Callable[[], Env], first: Env | None = None) -> ResumeCheck
 def knows_all_layers(env: Env) -> bool:
     """Whether the state of every layer can be captured at any step."""
     *wrappers, bare = _layers(env).values()
-    known = all(isinstance(layer, Stateful) or type(layer) in (TimeLimit, *_STATELESS) for layer in wrappers)
+    known = all(
+        isinstance(layer, Stateful) or _is_gymnasium_s(layer) or type(layer) in (TimeLimit, *_STATELESS)
+        for layer in wrappers
+    )
     return known and isinstance(bare, MujocoEnv | Stateful)
 
 

@@ -6,9 +6,9 @@ import argparse
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import imageio.v2 as imageio
 import numpy as np
@@ -131,9 +131,9 @@ def evaluate(given: argparse.Namespace) -> None:
     teacher, own = load_run(given.run_dir, given.trust)
     contents = []
     for name in given.env or [None]:
-        config = own if name is None else environment_config(name)
-        remark, actor = _policy(teacher, config, given, is_own=name is None)
-        contents.append(_evaluate_in(config, actor, remark, teacher, given))
+        config = own if name is None else _in_its_wrappers(environment_config(name), own)
+        placed = _place(teacher, config, given, is_own=name is None)
+        contents.append(_evaluate_in(config, placed, teacher, given))
         file = locate_teacher(given.run_dir).with_name(_file_name(config, is_own=name is None))
         _store(contents[-1], given.out or file)
     if len(contents) > 1:
@@ -144,18 +144,28 @@ def evaluate(given: argparse.Namespace) -> None:
             print(terminal(f"{content['environment']:<{width}}  {'  '.join(numbers)}  {content['mean_length']:>7,.0f}"))
 
 
-def _policy(
-    teacher: Teacher, config: EnvConfig, given: argparse.Namespace, *, is_own: bool
-) -> tuple[str | None, Actor]:
-    """A remark on the body, if there is one, and the policy in it."""
+def _in_its_wrappers(config: EnvConfig, own: EnvConfig) -> EnvConfig:
+    """Another body within the wrappers that the policy is used to, unless it has its own."""
+    return config if config.wrappers else replace(config, wrappers=own.wrappers)
+
+
+class _Placed(NamedTuple):
+    """A policy in a body: what wrappers around the body remember, and a remark if it is not quite the policy's own."""
+
+    actor: Actor
+    wrappers: dict[str, Any]
+    remark: str | None = None
+
+
+def _place(teacher: Teacher, config: EnvConfig, given: argparse.Namespace, *, is_own: bool) -> _Placed:
     if is_own:
         remark = check_fit(teacher, config)
         if remark:
             print(terminal(f"warning: {remark}"), file=sys.stderr)
-        return remark, teacher.build_networks().actor.eval()
-    actor, lines = policy_in(teacher, config, given.impute, given.trust)
+        return _Placed(teacher.build_networks().actor.eval(), teacher.wrapper_states(), remark)
+    actor, wrappers, lines = policy_in(teacher, config, given.impute, given.trust)
     print(terminal(f"{config.name}: {'; '.join(lines)}"))
-    return None, actor
+    return _Placed(actor, wrappers)
 
 
 def _file_name(config: EnvConfig, *, is_own: bool) -> str:
@@ -163,9 +173,7 @@ def _file_name(config: EnvConfig, *, is_own: bool) -> str:
     return EVALUATION_FILE if is_own else f"{path.stem}-{re.sub(r'[^A-Za-z0-9_.-]', '_', config.name)}{path.suffix}"
 
 
-def _evaluate_in(
-    config: EnvConfig, actor: Actor, remark: str | None, teacher: Teacher, given: argparse.Namespace
-) -> dict[str, Any]:
+def _evaluate_in(config: EnvConfig, placed: _Placed, teacher: Teacher, given: argparse.Namespace) -> dict[str, Any]:
     """Plays, prints each episode, and returns the content of the file."""
     if limit(config) is None:
         print(
@@ -174,9 +182,9 @@ def _evaluate_in(
         )
     episodes = []
     video = VideoOptions(given.video, given.seconds, given.width, given.height) if given.video else None
-    for episode in play(
-        actor, config, episodes=given.episodes, seed=given.seed, stochastic=given.stochastic, video=video
-    ):
+    actor, wrappers, remark = placed
+    options = {"episodes": given.episodes, "seed": given.seed, "stochastic": given.stochastic, "video": video}
+    for episode in play(actor, config, wrappers, **options):
         episodes.append(episode)
         end = "terminated" if episode.terminated else "time limit"
         print(

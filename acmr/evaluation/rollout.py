@@ -14,6 +14,7 @@ from acmr.agent.networks import Actor
 from acmr.config import EnvConfig
 from acmr.evaluation.video import Film
 from acmr.records import EpisodeInProgress
+from acmr.stateful import State
 
 #: Steps after which an episode is cut off where the environment has no time limit.
 MOST_STEPS = 10_000
@@ -56,13 +57,21 @@ class VideoOptions:
 
 
 def play(
-    actor: Actor, config: EnvConfig, *, episodes: int, seed: int, stochastic: bool, video: VideoOptions | None = None
+    actor: Actor,
+    config: EnvConfig,
+    wrappers: State,
+    *,
+    episodes: int,
+    seed: int,
+    stochastic: bool,
+    video: VideoOptions | None = None,
 ) -> Iterator[Episode]:
     """Plays episodes, each the same whatever came before it.
 
     Args:
         actor: The policy.
         config: Where it acts.
+        wrappers: What the wrappers around that have remembered; it stays as it is.
         episodes: How many to play.
         seed: The k-th episode (k = 0, 1, ...) is reset with ``seed + k``.
         stochastic: Sample actions, as in training; else take the mean action.
@@ -73,6 +82,7 @@ def play(
     """
     # As late as this: whoever imports this module decides how mujoco is loaded (acmr.evaluation.camera.without_gl).
     from acmr.envs import describe, make_env
+    from acmr.envs.wrappers.memory import give_lasting
 
     about = describe(config)
     env = make_env(config, render_mode=None if video is None else render_mode(config))
@@ -80,6 +90,7 @@ def play(
     try:
         for number in range(episodes):
             noise = torch.Generator().manual_seed(seed + number)
+            give_lasting(env, wrappers, settled=True)
             observation, _ = env.reset(seed=seed + number)
             episode, terminated, truncated = EpisodeInProgress((), about.has_forward_velocity), False, False
             while not (terminated or truncated):

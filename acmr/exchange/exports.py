@@ -7,17 +7,23 @@ import logging
 import sys
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import torch
+from gymnasium.wrappers import NormalizeObservation
 from torch import Tensor, nn
 
 from acmr.agent.networks import Actor
 from acmr.command import command, typed
 from acmr.config import ConfigError
+from acmr.envs.wrappers.carried import AGO
+from acmr.envs.wrappers.chosen import NAME
 from acmr.evaluation.evaluate import load_policy
+from acmr.exchange.imported import Normalization, for_plain_observations
 from acmr.exchange.sb3_writer import write_sb3
 from acmr.names import terminal
 from acmr.transfer.teacher import Teacher
@@ -95,6 +101,35 @@ def _example(teacher: Teacher) -> Tensor:
     return torch.zeros(2, teacher.description.dims.observation)
 
 
+def _for_others(teacher: Teacher) -> tuple[Teacher, str]:
+    """The policy without the running normalization around it, which other programs do not have; and a note on that."""
+    about = teacher.description
+    told = about.config.get("env")
+    wrappers = [entry.get(NAME) for entry in told.get("wrappers") or []] if isinstance(told, dict) else []
+    if not wrappers:
+        return teacher, ""
+    states = [state for state in teacher.wrapper_states().values() if "names" in state]
+    # Two of them, or what else scales, is more than one linear layer can be told in general.
+    if len(states) != 1 or not set(wrappers) <= {"NormalizeObservation", "FrameStackObservation", "NormalizeReward"}:
+        return teacher, f"it expects observations from within the wrappers {', '.join(map(str, wrappers))}"
+    state = states[0]
+    rows = {name: row for row, name in enumerate(state["names"])}
+    # Frames that are stacked outside of it were normalized alike, whenever they were seen.
+    found = [rows.get(name, rows.get(name.partition(AGO)[0])) for name in about.observation_names]
+    if None in found:
+        return teacher, "it expects observations that are normalized as in its training"
+    normalization = Normalization(state["mean"][found], state["var"][found], _epsilon(told))
+    tensors = for_plain_observations(teacher.tensors, normalization, about.dims)
+    plain = replace(teacher, tensors={name: tensor.float() for name, tensor in tensors.items()})
+    return plain, "the running normalization is part of the first layers now: it expects observations as they are"
+
+
+def _epsilon(env: Any) -> float:
+    """What the normalization adds to the variance; Gymnasium's own value where none was typed."""
+    given = next(entry for entry in env["wrappers"] if entry.get(NAME) == "NormalizeObservation")
+    return float(given.get("epsilon", signature(NormalizeObservation).parameters["epsilon"].default))
+
+
 def _sb3(teacher: Teacher, path: Path) -> None:
     needed("sb3", "stable_baselines3")
     write_sb3(teacher, path)
@@ -120,7 +155,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = ", ".join(f"--{name} {example}" for name, (_, example) in _WRITERS.items())
         parser.error(f"nothing to write; type one or more of {options}")
     try:
-        teacher = load_policy(given.run)[0]
+        teacher, note = _for_others(load_policy(given.run)[0])
+        if note:
+            print(terminal(f"note: {note}"))
         for name, path in chosen.items():
             if not path.parent.is_dir():
                 raise ConfigError(f"--{name} {path}: there is no folder {path.parent}")

@@ -87,6 +87,11 @@ def make_teacher(
         raise ConfigError(
             f"--env {env.name}: has {dims}, but the networks are for {found.dims}; name the environment they learned in"
         )
+    if about.normalized:
+        raise ConfigError(
+            f"--env {env.name}: normalizes observations by running statistics, of which the file says nothing; name an "
+            "environment without, and give the statistics with --normalization FILE.npz (docs/exchange.md)"
+        )
     low, high = (np.asarray(bound, np.float32) for bound in (about.action_low, about.action_high))
     _check_bounds(found, env, low, high)
     architecture = replace(Architecture.plain(dims, found.hidden_sizes, low, high), log_std=found.log_std)
@@ -96,7 +101,7 @@ def make_teacher(
         if shapes.get(name) != shape:
             raise ConfigError(f"{name}: the file has it in the shape {shapes.get(name)}; {shape} is needed")
     tensors = _for_plain_actions(found.tensors, low, high) if found.scaled_actions else found.tensors
-    tensors = tensors if normalization is None else _for_plain_observations(tensors, normalization, dims)
+    tensors = tensors if normalization is None else for_plain_observations(tensors, normalization, dims)
     networks = Networks(architecture, torch.Generator().manual_seed(0))
     networks.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
     return networks, TeacherDescription(
@@ -148,10 +153,16 @@ def _for_plain_actions(tensors: Mapping[str, Tensor], low: np.ndarray, high: np.
     return made
 
 
-def _for_plain_observations(
+def for_plain_observations(
     tensors: Mapping[str, Tensor], normalization: Normalization, dims: Dimensions
 ) -> dict[str, Tensor]:
-    """Networks for observations as they are in place of normalized ones: that goes into the first layers, too."""
+    """Networks for observations as they are in place of normalized ones: that goes into the first layers, too.
+
+    Args:
+        tensors: By the names of our layers.
+        normalization: What the observations went through.
+        dims: Sizes of the environment.
+    """
     mean, var = normalization.mean, normalization.var
     if mean.shape != (dims.observation,) or var.shape != mean.shape:
         raise ConfigError(
@@ -159,9 +170,10 @@ def _for_plain_observations(
         )
     made = {name: tensor.double() for name, tensor in tensors.items()}
     center, spread = torch.from_numpy(mean), torch.from_numpy(np.sqrt(var + normalization.epsilon))
-    for part in (ACTOR, *CRITICS):
-        weight = made[f"{part}.input.weight"].clone()
+    first = "input_adapter" if f"{ACTOR}.input_adapter.weight" in made else "input"
+    for name in (f"{part}.{first}" for part in (ACTOR, *CRITICS)):
+        weight = made[f"{name}.weight"].clone()
         weight[:, : dims.observation] /= spread
-        made[f"{part}.input.weight"] = weight
-        made[f"{part}.input.bias"] = made[f"{part}.input.bias"] - weight[:, : dims.observation] @ center
+        made[f"{name}.weight"] = weight
+        made[f"{name}.bias"] = made[f"{name}.bias"] - weight[:, : dims.observation] @ center
     return made

@@ -63,7 +63,7 @@ def import_teacher(
     say(f"playing {EPISODES} episodes, so that students can be told what it sees and does on average")
     statistics: PolicyStatistics | None = None
     try:
-        statistics = measure_policy(networks.actor, env)
+        statistics = measure_policy(networks.actor, env, {})
     except Exception as error:
         # Whatever the environment does: the networks are what was asked for.
         say(f"warning: it could not be played ({one_line(error)}); its students cannot be told means")

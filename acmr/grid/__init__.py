@@ -3,6 +3,7 @@
 The simulation is grid2op's, its power flow lightsim2grid's; both come with the extra ``grid``.
 """
 
+import importlib
 import importlib.util
 import warnings
 
@@ -12,8 +13,10 @@ for _package in ("grid2op", "lightsim2grid"):
     if importlib.util.find_spec(_package) is None:
         raise ModuleNotFoundError(f"{_package} is not installed; type pip install 'acmr[grid]'", name=_package)
 
-# It advises on a package that speeds up another power flow than the one used here.
-warnings.filterwarnings("ignore", "Numba cannot be loaded")
+with warnings.catch_warnings():
+    # It advises, once, on a package that speeds up another power flow than the one used here.
+    warnings.filterwarnings("ignore", "Numba cannot be loaded")
+    importlib.import_module("grid2op.Backend")
 
 # A day in steps of five minutes.
 gym.register("PowerGrid-v0", "acmr.grid.environment:PowerGridEnv", max_episode_steps=288)

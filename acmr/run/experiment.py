@@ -138,7 +138,8 @@ class Session:
             state.clock.start()
             summary = self._summary(checkpoints, state, _train(trainer))
             if summary["status"] != DIVERGED:
-                description = describe_teacher(spec, self.prepared.about, trainer.agent, summary, self.say)
+                about = self.prepared.about
+                description = describe_teacher(spec, about, trainer.agent, state.environment, summary, self.say)
                 save_teacher(run_dir.path, trainer.agent.networks, description)
             # Every row is on the disk before anything says that the run is finished, and a run with a summary is.
             files = {run_dir.config_file.name: self._settings, **state.logs.digests()}

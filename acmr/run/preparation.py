@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -40,6 +41,7 @@ class Prepared:
         streams: Its random numbers.
         products: How matrix products are computed from now on.
         resume_check: When the environment's state can be stored.
+        wrapper_states: What wrappers around the environment begin with, where a teacher's have seen something.
     """
 
     spec: RunSpec
@@ -53,6 +55,7 @@ class Prepared:
     streams: RandomStreams
     products: MatmulPrecision
     resume_check: ResumeCheck
+    wrapper_states: dict[str, Any]
 
 
 def prepare(spec: RunSpec) -> Prepared:
@@ -77,7 +80,7 @@ def prepare(spec: RunSpec) -> Prepared:
     architecture = Architecture(dims, tuple(config.agent.hidden_sizes), about.action_low, about.action_high)
     check_memory(config, architecture)
     fresh = Networks(architecture, streams.networks)
-    student = Student(fresh, about.observation_names, about.action_names)
+    student = Student(fresh, about.observation_names, about.action_names, config.env.wrappers, about.normalized)
     transferred = transfer(student, teacher, config.transfer, config.freeze, streams.networks, config.thaw)
     log_alpha = teacher.log_alpha() if teacher is not None and config.transfer.copy_log_alpha else 0.0
     return Prepared(
@@ -92,6 +95,7 @@ def prepare(spec: RunSpec) -> Prepared:
         streams=streams,
         products=choose_products(config.agent, config.device),
         resume_check=resume_check,
+        wrapper_states=transferred.wrapper_states,
     )
 
 

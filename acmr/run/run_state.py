@@ -125,7 +125,8 @@ class RunState:
 
 def make_state(prepared: Prepared, run_dir: RunDir) -> RunState:
     """Makes the parts of a run as they are before its first step; touches no disk."""
-    env = RestorableEnv(make_env(prepared.spec.config.env), whole=prepared.resume_check.when == ANYTIME)
+    made = make_env(prepared.spec.config.env, wrappers=prepared.wrapper_states)
+    env = RestorableEnv(made, whole=prepared.resume_check.when == ANYTIME)
     logs = RunLogs(run_dir, prepared.about)
     warnings = PhysicsWarnings(env)
     trainer = make_trainer(prepared, warnings, logs)

@@ -11,16 +11,22 @@ import numpy as np
 from acmr.agent.learner import Learner
 from acmr.config import THRESHOLD
 from acmr.envs import EnvDescription
+from acmr.envs.state import RestorableEnv
+from acmr.envs.wrappers.memory import lasting_state
 from acmr.records import COMPLETE, DIVERGED, NO_EPISODE, EpisodeRecord, portable_settings, steps_to_threshold
 from acmr.run.reproducibility import git_commit, machine, versions
 from acmr.run.trainer import DivergedError
 from acmr.settings.run_spec import RunSpec
-from acmr.text import one_line
+from acmr.stateful import State
+from acmr.storage.state_data import as_json
+from acmr.text import one_line, size
 from acmr.transfer.description import FORMAT_VERSION, PolicyStatistics, TeacherDescription
 from acmr.transfer.statistics import measure_policy
 
 #: Episodes that the final return is the mean of.
 FINAL_EPISODES = 10
+#: Bytes that the description of a teacher holds of what wrappers remember, at most: far less than its readers take.
+_MOST_TOLD = 1 << 20
 
 
 def summarize(
@@ -70,7 +76,12 @@ def summarize(
 
 
 def describe_teacher(
-    spec: RunSpec, about: EnvDescription, agent: Learner, summary: Mapping[str, Any], say: Callable[[str], None]
+    spec: RunSpec,
+    about: EnvDescription,
+    agent: Learner,
+    env: RestorableEnv,
+    summary: Mapping[str, Any],
+    say: Callable[[str], None],
 ) -> TeacherDescription:
     """What the file of the final networks says of them.
 
@@ -78,10 +89,14 @@ def describe_teacher(
         spec: The run.
         about: Its environment.
         agent: The learner at the end.
+        env: The environment at the end.
         summary: The content of ``summary.json``.
         say: Where a line goes if the policy cannot be played.
     """
-    made = agent.networks.architecture
+    made, states = agent.networks.architecture, lasting_state(env.env)
+    for wrapper, names in about.normalized.items():
+        states[wrapper]["names"] = list(names)
+    told = _told(states, say)
     return TeacherDescription(
         format_version=FORMAT_VERSION,
         environment=spec.config.env.name,
@@ -101,14 +116,28 @@ def describe_teacher(
         final_return=summary["final_return"],
         config=json.loads(json.dumps(portable_settings(spec.settings))),
         log_std=made.log_std,
-        statistics=_statistics(spec, agent, say),
+        statistics=_statistics(spec, agent, states, say),
+        wrappers=told,
     )
 
 
-def _statistics(spec: RunSpec, agent: Learner, say: Callable[[str], None]) -> PolicyStatistics | None:
+def _told(states: State, say: Callable[[str], None]) -> dict[str, Any] | None:
+    """What wrappers remember, as the description holds it; one of the user's may remember what it does not."""
+    try:
+        told = as_json(states) if states else None
+        if len(json.dumps(told, allow_nan=False)) <= _MOST_TOLD:
+            return told
+        why = f"more than {size(_MOST_TOLD)}"
+    except (TypeError, ValueError) as error:
+        why = one_line(error)
+    say(f"warning: what {', '.join(states)} remember is not stored with the networks ({why}): evaluations begin anew")
+    return None
+
+
+def _statistics(spec: RunSpec, agent: Learner, wrappers: State, say: Callable[[str], None]) -> PolicyStatistics | None:
     """What the final policy sees and does."""
     try:
-        return measure_policy(agent.networks.actor, spec.config.env)
+        return measure_policy(agent.networks.actor, spec.config.env, wrappers)
     except Exception as error:
         # Whatever an environment does once more: the run is finished, and only its students would ask for this.
         say(f"warning: the final policy could not be played ({one_line(error)}); its students cannot be told means")

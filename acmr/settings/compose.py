@@ -242,6 +242,8 @@ def as_override(value: object) -> str:
         return repr(value)
     if isinstance(value, list | tuple):
         return "[" + ",".join(as_override(entry) for entry in value) + "]"
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{as_override(key)}:{as_override(entry)}" for key, entry in value.items()) + "}"
     text = str(value)
     if re.fullmatch(r"[A-Za-z_./-][A-Za-z0-9_./+-]*", text):
         return text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -63,12 +64,12 @@ class RunSpec:
     @property
     def command(self) -> str:
         """The shortest command line that makes this run."""
-        return " ".join([typed(), *sources().words, *_short_overrides(self)])
+        return " ".join([typed(), *sources().words, *map(in_shell, _short_overrides(self))])
 
     @property
     def sweep_command(self) -> str:
         """The command line that makes this run after the teacher that it needs."""
-        return " ".join([typed(), "-m", *sources().words, *_short_overrides(self)])
+        return " ".join([typed(), "-m", *sources().words, *map(in_shell, _short_overrides(self))])
 
 
 def specify(config: ExperimentConfig) -> RunSpec:
@@ -141,6 +142,11 @@ def _short_overrides(spec: RunSpec) -> list[str]:
     if config.output_dir != default.output_dir:
         said.append(f"output_dir={as_override(config.output_dir)}")
     return said
+
+
+def in_shell(word: str) -> str:
+    """A word of the command line as it is typed: in quotes if it holds braces, which a shell would take apart."""
+    return shlex.quote(word) if "{" in word else word
 
 
 def _teacher_mark(path: str) -> str:

@@ -85,6 +85,11 @@ def _code(config: EnvConfig) -> Iterator[str]:
         yield f"env.id={config.id}"
     # Whatever the key is called: a text may be a model file, a wrapper, a module, an environment within this one.
     yield from (f"env.kwargs.{key}" for key, value in config.kwargs.items() if not _is_number(value))
+    for place, wrapper in enumerate(config.wrappers):
+        if ":" in wrapper["name"]:
+            yield f"env.wrappers[{place}].name={wrapper['name']}"
+        texts = (key for key, value in wrapper.items() if key != "name" and not _is_number(value))
+        yield from (f"env.wrappers[{place}].{key}" for key in texts)
 
 
 def _is_number(value: object) -> bool:
@@ -102,6 +107,10 @@ def _endless(config: EnvConfig) -> Iterator[str]:
         most = _MOST_FRAMES if key == "frame_skip" else _MOST
         if any(abs(number) > most for number in _whole_numbers(value)):
             yield f"env.kwargs.{key}={value}"
+    # Observations that are stacked, actions that are repeated.
+    for place, wrapper in enumerate(config.wrappers):
+        if any(abs(number) > _MOST_FRAMES for value in wrapper.values() for number in _whole_numbers(value)):
+            yield f"env.wrappers[{place}]={wrapper}"
 
 
 def _whole_numbers(value: object) -> Iterator[int]:
@@ -120,7 +129,8 @@ def _is_in_conf(config: EnvConfig, limit: bool = False) -> bool:
     except ConfigError:
         return False
     limits = (own.max_episode_steps, config.max_episode_steps) if limit else (None, None)
-    return (own.id, own.kwargs, limits[0]) == (config.id, config.kwargs, limits[1])
+    theirs = (config.id, config.kwargs, config.wrappers, limits[1])
+    return (own.id, own.kwargs, own.wrappers, limits[0]) == theirs
 
 
 def _mapping(settings: object) -> Mapping[Any, Any]:

@@ -132,6 +132,13 @@ def check_environment(config: EnvConfig) -> None:
     """
     if config.max_episode_steps is not None:
         _at_least("env.max_episode_steps", config.max_episode_steps, 1)
+    for wrapper in config.wrappers:
+        name = wrapper.get("name")
+        if not isinstance(name, str) or not name:
+            raise ConfigError(
+                f"env.wrappers={config.wrappers}: each needs its name, as in "
+                "'env.wrappers=[{name: FrameStackObservation, stack_size: 3}]'"
+            )
 
 
 def _check_impute(rule: str) -> None:

@@ -59,6 +59,39 @@ def join(values: dict[str, Any], arrays: dict[str, np.ndarray]) -> State:
     return state
 
 
+def as_json(state: State) -> dict[str, Any]:
+    """A small state as JSON holds it, its arrays as lists of numbers; each number comes back as it was.
+
+    Raises:
+        TypeError: As :func:`split`.
+    """
+    values, arrays = split(state)
+    told = {
+        name: {"dtype": str(array.dtype), "shape": list(array.shape), "data": array.ravel().tolist()}
+        for name, array in arrays.items()
+    }
+    return {"values": values, "arrays": told}
+
+
+def from_json(content: Any) -> State:
+    """Reverses :func:`as_json`.
+
+    Raises:
+        ValueError: If it is not what that writes.
+    """
+    try:
+        arrays = {name: _array(**entry) for name, entry in content["arrays"].items()}
+        return join(dict(content["values"]), arrays)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise ValueError("no state") from error
+
+
+def _array(dtype: str, shape: list[int], data: list[float]) -> np.ndarray:
+    if np.dtype(dtype).kind not in "biuf":
+        raise ValueError(dtype)
+    return np.array(data, dtype).reshape(shape)
+
+
 def _is_plain(leaf: object) -> bool:
     # The type itself: a NumPy number is a float, too, but would come back as Python's, which rounds differently.
     return type(leaf) in (type(None), bool, int, float, str) or (type(leaf) is list and all(map(_is_plain, leaf)))

@@ -12,6 +12,7 @@ from acmr.agent.architecture import LOG_STD_BOUNDS, TANH, Architecture, Dimensio
 from acmr.config import ACTIVATIONS, ConfigError
 from acmr.foreign import DESCRIPTIONS, read_mapping
 from acmr.records import DamagedError, description_sha256
+from acmr.storage.state_data import from_json
 
 FORMAT_VERSION = 2
 #: Version 1 knew no statistics.
@@ -19,7 +20,7 @@ _READABLE = (1, FORMAT_VERSION)
 #: What numbers a tensor file may hold: those of a run, and those of one that is published in half the bytes.
 FULL, HALF = "float32", "float16"
 #: Entries of a description that are written only where they say something.
-_OPTIONAL = ("precision", "full_sha256", "statistics", "log_std", "imported")
+_OPTIONAL = ("precision", "full_sha256", "statistics", "log_std", "imported", "wrappers")
 #: Layers wider than this are none of ours.
 _MAX_WIDTH = 1 << 20
 
@@ -76,6 +77,8 @@ class TeacherDescription:
         full_sha256: Of the tensor file in full precision that this one was rounded from; empty for a full one.
         log_std: How the policy's log standard deviation is bounded, ``tanh`` or ``clamp``.
         imported: Of networks that another program trained, which program; empty for those of a run.
+        wrappers: What wrappers around its environment remembered at the end, as JSON; None where none did
+            (:mod:`acmr.envs.wrappers.memory`).
     """
 
     format_version: int
@@ -102,6 +105,7 @@ class TeacherDescription:
     full_sha256: str = ""
     log_std: str = TANH
     imported: str = ""
+    wrappers: dict[str, Any] | None = None
 
     @property
     def dims(self) -> Dimensions:
@@ -192,10 +196,19 @@ def _wrong_entries(about: TeacherDescription) -> list[str]:
         "adapter_activation": isinstance(about.adapter_activation, str) and about.adapter_activation in ACTIVATIONS,
         "config": isinstance(about.config, dict),
         "precision": about.precision in (FULL, HALF),
+        "wrappers": about.wrappers is None or _is_state(about.wrappers),
         "statistics": about.statistics is None or _are_statistics(about.statistics, about.dims),
         **{name: isinstance(getattr(about, name), str) for name in texts},
     }
     return [name for name, is_good in good.items() if not is_good]
+
+
+def _is_state(content: object) -> bool:
+    try:
+        from_json(content)
+    except ValueError:
+        return False
+    return True
 
 
 def _are_statistics(told: PolicyStatistics, dims: Dimensions) -> bool:

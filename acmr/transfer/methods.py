@@ -13,13 +13,15 @@ from typing import Any
 
 import torch
 
-from acmr.agent.architecture import Dimensions, is_adapter, is_hidden
+from acmr.agent.architecture import ACTOR, Dimensions, is_adapter, is_hidden
 from acmr.agent.fine_tuning import thaw_schedule
 from acmr.agent.networks import Networks
 from acmr.config import NAMES, NO_ACTIVATION, ConfigError, TransferConfig
 from acmr.registry import Registry, named_in
+from acmr.stateful import State
 from acmr.transfer.audition import Audition, Biases
 from acmr.transfer.report import TransferReport, report_transfer
+from acmr.transfer.statistics import check_units, handed_over
 from acmr.transfer.teacher import Teacher
 
 
@@ -31,11 +33,15 @@ class Student:
         networks: Fresh ones, in the dimensions of its environment.
         observation_names: One per observation.
         action_names: One per action.
+        wrappers: Those that were chosen around its environment.
+        normalized: Its sensors that each of them normalizes by running statistics, by the wrapper's name.
     """
 
     networks: Networks
     observation_names: Sequence[str]
     action_names: Sequence[str]
+    wrappers: Sequence[Mapping[str, Any]] = ()
+    normalized: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -69,12 +75,14 @@ class Transferred:
         report: What became of each layer.
         audition: Which of several ways to begin it takes; there may be none to choose from.
         thaws: Environment step from which frozen layers learn, by their names.
+        wrapper_states: What the wrappers around its environment begin with; empty: as new ones.
     """
 
     networks: Networks
     report: TransferReport
     audition: Audition
     thaws: dict[str, int]
+    wrapper_states: State = field(default_factory=dict)
 
 
 #: Student, teacher (None where the method's rules say that it needs none), settings, source of new weights.
@@ -141,12 +149,22 @@ def transfer(
     thaws = thaw_schedule(frozen, thaw)
     details, notes = taken.details | ({"thaws": thaws} if thaws else {}), [*taken.lines, *_thaw_lines(thaws)]
     report = replace(report, details=details, notes=notes)
-    return Transferred(taken.networks, report, Audition(taken.choices), thaws)
+    states = _wrapper_states(student, teacher, taken, config)
+    return Transferred(taken.networks, report, Audition(taken.choices), thaws, states)
 
 
 def _thaw_lines(thaws: Mapping[str, int]) -> list[str]:
     layers = {step: [name for name, begin in thaws.items() if begin == step] for step in sorted(set(thaws.values()))}
     return [f"from step {step:,} on, these learn again: {', '.join(names)}" for step, names in layers.items()]
+
+
+def _wrapper_states(student: Student, teacher: Teacher | None, taken: Taken, config: TransferConfig) -> State:
+    """What the student's wrappers begin with: what the teacher's ended with, where its first layer was taken."""
+    first = "input" if taken.networks.architecture.core is None else "input_adapter"
+    if teacher is None or f"{ACTOR}.{first}" not in (*taken.copied, *taken.fitted):
+        return {}
+    check_units(teacher, student.wrappers, config)
+    return handed_over(teacher, student.normalized, config)
 
 
 def _bound_alike(taken: Taken, teacher: Teacher | None) -> Taken:

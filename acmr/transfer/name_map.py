@@ -104,6 +104,18 @@ def map_bodies(
     return names
 
 
+def parse_renames(pairs: Sequence[str]) -> dict[str, str]:
+    """The setting ``transfer.rename`` as a mapping.
+
+    Raises:
+        ConfigError: If an entry is not ``old:new``.
+    """
+    wrong = [pair for pair in pairs if pair.count(":") != 1 or not all(pair.split(":"))]
+    if wrong:
+        raise ConfigError(f"transfer.rename: {wrong[0]}: names are given as in 'transfer.rename={{old: new}}'")
+    return {old.strip(): new.strip() for old, new in (pair.split(":") for pair in pairs)}
+
+
 def _known(given: str, who: str, name: str, names: Sequence[str]) -> None:
     if name in names:
         return

@@ -18,7 +18,7 @@ from acmr.agent.networks import Networks
 from acmr.config import AUTO, INITIAL, MEAN, ZERO, ConfigError, TransferConfig, share_of_mean
 from acmr.transfer.audition import Biases
 from acmr.transfer.methods import Student, Taken, copy_layers, method
-from acmr.transfer.name_map import NameMap, PartMap, map_bodies
+from acmr.transfer.name_map import NameMap, PartMap, map_bodies, parse_renames
 from acmr.transfer.teacher import Teacher
 
 #: Share of its usual size with which the head of an added actuator begins: it hardly moves at first.
@@ -32,7 +32,7 @@ def named(student: Student, teacher: Teacher, config: TransferConfig, generator:
     """All layers; the first and the last ones column by column and row by row."""
     about = teacher.description
     theirs, ours = ((each.observation_names, each.action_names) for each in (about, student))
-    names = map_bodies(theirs, ours, renamed(config.rename), config.rules.or_instead)
+    names = map_bodies(theirs, ours, parse_renames(config.rename), config.rules.or_instead)
     networks = student.networks
     if about.core is not None:
         # The adapters of a teacher that was itself expanded are what its sensors and actuators touch.
@@ -52,18 +52,6 @@ def named(student: Student, teacher: Teacher, config: TransferConfig, generator:
     }
     lines = [*names.lines(), *([f"what is gone counts as {_said(config.impute)}"] if names.is_less else [])]
     return Taken(networks, inner, outer, details, lines, choices={rule: choices[rule] for rule in rules})
-
-
-def renamed(pairs: Sequence[str]) -> dict[str, str]:
-    """The setting ``transfer.rename`` as a mapping.
-
-    Raises:
-        ConfigError: If an entry is not ``old:new``.
-    """
-    wrong = [pair for pair in pairs if pair.count(":") != 1 or not all(pair.split(":"))]
-    if wrong:
-        raise ConfigError(f"transfer.rename: {wrong[0]}: names are given as in 'transfer.rename={{old: new}}'")
-    return {old.strip(): new.strip() for old, new in (pair.split(":") for pair in pairs)}
 
 
 def _said(rule: str) -> str:

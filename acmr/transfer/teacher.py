@@ -21,8 +21,10 @@ from acmr.agent.networks import Networks
 from acmr.config import ConfigError
 from acmr.foreign import NETWORKS, is_there, read_bytes
 from acmr.records import DESCRIPTION_FILE, TENSOR_FILE, DamagedError, description_sha256
+from acmr.stateful import State
 from acmr.storage.durable import write_bytes
 from acmr.storage.json_files import write_json
+from acmr.storage.state_data import from_json
 from acmr.transfer.description import FULL, HALF, TeacherDescription, read_description
 
 
@@ -39,6 +41,10 @@ class Teacher:
         networks = Networks(self.description.architecture, torch.Generator().manual_seed(0))
         networks.load_state_dict(self.tensors)
         return networks
+
+    def wrapper_states(self) -> State:
+        """What the wrappers around its environment remembered at the end, by their names; empty if none did."""
+        return {} if self.description.wrappers is None else from_json(self.description.wrappers)
 
     def log_alpha(self) -> float:
         """Log of its temperature, for a student that begins with it (``transfer.copy_log_alpha``).
@@ -84,6 +90,8 @@ def _write(folder: Path, tensors: dict[str, Tensor], description: TeacherDescrip
         del content["log_std"]
     if not description.imported:
         del content["imported"]
+    if description.wrappers is None:
+        del content["wrappers"]
     content["description_sha256"] = description_sha256(content)
     # The description last: it names the hash of the tensors, so a kill in between leaves a pair that is refused.
     write_bytes(folder / TENSOR_FILE, data)

@@ -1,0 +1,1 @@
+"""Layers around an environment: those that the user chooses, and the one that takes sensors and actuators away."""
