@@ -49,6 +49,9 @@ NAMES = "names"
 MEAN, ZERO, INITIAL, AUTO = "mean", "zero", "initial", "auto"
 IMPUTATIONS = (AUTO, MEAN, ZERO, INITIAL)
 
+#: What a control takes from a teacher: nothing, the order of its names, or what its weights have learned.
+NO_CONTROL, SHUFFLED, UNTRAINED = CONTROLS = ("none", "shuffled", "untrained")
+
 
 def share_of_mean(rule: str) -> float | None:
     """The share of the mean that a rule of ``transfer.impute`` asks for; None for ``initial``, ``auto`` and others."""
@@ -190,6 +193,8 @@ class TransferConfig:
     #: What those count as that the student has not (``named`` only): their ``mean``, a share of it such as ``0.75``,
     #: ``zero``, or their ``initial`` mean; ``auto`` tries some of these in the first episodes, and keeps the best.
     impute: str = MEAN
+    #: For a comparison, a teacher whose names are ``shuffled``, or one with its fresh weights, ``untrained``.
+    control: str = NO_CONTROL
     #: Free room for the settings of methods that are added.
     options: dict[str, Any] = field(default_factory=dict)
 

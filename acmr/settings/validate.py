@@ -9,6 +9,7 @@ from dataclasses import asdict
 from acmr.command import typed
 from acmr.config import (
     ACTIVATIONS,
+    CONTROLS,
     END_METRICS,
     EXACT,
     HORIZON,
@@ -16,12 +17,14 @@ from acmr.config import (
     INEXACT,
     METRICS,
     NAMES,
+    NO_CONTROL,
     POLICY,
     PRECISIONS,
     PROGRESS_MODES,
     RANDOM,
     RELU,
     SEEDINGS,
+    SHUFFLED,
     STEPS,
     THRESHOLD,
     ConfigError,
@@ -95,6 +98,7 @@ def validate(config: ExperimentConfig) -> None:
     _one_of("metric", config.metric, METRICS)
     _one_of("transfer.adapter_activation", config.transfer.adapter_activation, ACTIVATIONS)
     _one_of("transfer.adapter_init", config.transfer.adapter_init, (RANDOM, NAMES))
+    _one_of("transfer.control", config.transfer.control, CONTROLS)
     _check_impute(config.transfer.impute)
     check_address("tracking.base_url", config.tracking.base_url)
     for key, value in flatten(asdict(config)).items():
@@ -196,6 +200,12 @@ def _check_transfer(config: ExperimentConfig) -> None:
             f"transfer.adapter_init={NAMES} transfer.adapter_activation={RELU}: the ReLU would cut off whatever is "
             "below zero, so that the teacher's layers would not see its sensors; type transfer.adapter_activation=none"
         )
+    if transfer.control != NO_CONTROL and not rules.needs_teacher:
+        raise ConfigError(
+            f"{name} transfer.control={transfer.control}: there is no teacher; leave it out{rules.or_instead}"
+        )
+    if transfer.control == SHUFFLED and not (rules.statistics or transfer.adapter_init == NAMES):
+        raise ConfigError(f"{name} transfer.control={SHUFFLED}: reads no names; leave it out, or type transfer=named")
     if config.freeze and not rules.freezable:
         why = (
             f"every layer would be frozen and nothing could learn ({typed('evaluate')} shows what a teacher does)"

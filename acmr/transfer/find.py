@@ -1,9 +1,15 @@
-"""Finds the teacher of a student."""
+"""Finds the teacher of a student, or makes of it what a control has in its place."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+import torch
+
 from acmr.agent.architecture import Dimensions
-from acmr.config import NAMES, ZERO, ConfigError, ExperimentConfig
+from acmr.agent.networks import Networks
+from acmr.config import NAMES, SHUFFLED, UNTRAINED, ZERO, ConfigError, ExperimentConfig
 from acmr.envs import describe
 from acmr.settings.run_spec import specify, teacher_spec
 from acmr.storage.run_dir import RunDir
@@ -25,8 +31,33 @@ def find_teacher(config: ExperimentConfig, dims: Dimensions) -> Teacher | None:
     if not config.transfer.rules.needs_teacher:
         return None
     teacher = load_teacher(config.transfer.teacher) if config.transfer.teacher is not None else _implied(config, dims)
+    if config.transfer.control == UNTRAINED:
+        teacher = untrained(teacher, config.seed)
     stands_in = config.transfer.rules.statistics or config.transfer.adapter_init == NAMES
-    return with_statistics(teacher) if stands_in and config.transfer.impute != ZERO else teacher
+    if stands_in and config.transfer.impute != ZERO:
+        teacher = with_statistics(teacher)
+    return shuffled(teacher, config.seed) if config.transfer.control == SHUFFLED else teacher
+
+
+def untrained(teacher: Teacher, seed: int) -> Teacher:
+    """The teacher as it might have begun: other fresh weights, no temperature learned, nothing seen yet."""
+    architecture = teacher.description.architecture
+    fresh = Networks(architecture, torch.Generator().manual_seed(seed)).state_dict()
+    return replace(teacher, description=replace(teacher.description, log_alpha=0.0, statistics=None), tensors=fresh)
+
+
+def shuffled(teacher: Teacher, seed: int) -> Teacher:
+    """The teacher with the names of its sensors, and those of its actuators, dealt out anew: none is where it was."""
+    about, rng = teacher.description, np.random.default_rng(seed)
+
+    def deal(names: list[str]) -> list[str]:
+        # Each gets the next one's name on a random way around: a cycle, so that nobody keeps their own.
+        way = rng.permutation(len(names))
+        dealt = dict(zip(way, np.roll(way, 1), strict=True))
+        return [names[dealt[row]] for row in range(len(names))]
+
+    sensors, actuators = deal(about.observation_names), deal(about.action_names)
+    return replace(teacher, description=replace(about, observation_names=sensors, action_names=actuators))
 
 
 def _implied(config: ExperimentConfig, dims: Dimensions) -> Teacher:

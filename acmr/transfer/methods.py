@@ -16,7 +16,7 @@ import torch
 from acmr.agent.architecture import ACTOR, Dimensions, is_adapter, is_hidden
 from acmr.agent.fine_tuning import thaw_schedule
 from acmr.agent.networks import Networks
-from acmr.config import NAMES, NO_ACTIVATION, ConfigError, TransferConfig
+from acmr.config import NAMES, NO_ACTIVATION, NO_CONTROL, SHUFFLED, ConfigError, TransferConfig
 from acmr.registry import Registry, named_in
 from acmr.stateful import State
 from acmr.transfer.audition import Audition, Biases
@@ -147,10 +147,17 @@ def transfer(
         layers[name].requires_grad_(False)
     report = report_transfer(taken.networks, teacher, config, freeze, (taken.copied, taken.fitted, frozen))
     thaws = thaw_schedule(frozen, thaw)
-    details, notes = taken.details | ({"thaws": thaws} if thaws else {}), [*taken.lines, *_thaw_lines(thaws)]
-    report = replace(report, details=details, notes=notes)
+    control = config.control if config.control != NO_CONTROL else None
+    more = {"thaws": thaws, "control": control}
+    details = taken.details | {key: value for key, value in more.items() if value}
+    report = replace(report, details=details, notes=[*taken.lines, *_control_lines(control), *_thaw_lines(thaws)])
     states = _wrapper_states(student, teacher, taken, config)
     return Transferred(taken.networks, report, Audition(taken.choices), thaws, states)
+
+
+def _control_lines(control: str | None) -> list[str]:
+    what = "its names dealt out anew" if control == SHUFFLED else "fresh weights in the place of its own"
+    return [f"a control: the teacher with {what}"] if control else []
 
 
 def _thaw_lines(thaws: Mapping[str, int]) -> list[str]:
