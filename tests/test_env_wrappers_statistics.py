@@ -44,6 +44,18 @@ def test_a_killed_run_goes_on_bit_for_bit_with_its_statistics(untouched, tmp_pat
     assert counted == pytest.approx(about["global_step"] + begun)
 
 
+def test_returns_are_raw_where_rewards_are_normalized(untouched):
+    """Before it learns, it does what the robot without wrappers does, and is paid the same."""
+    later = (*(word for word in WORDS if "learning_starts" not in word), "agent.learning_starts=280")
+    words = (later, tuple(word for word in later if "wrappers" not in word))
+    first, plain = ([float(row["episodic_return"]) for row in rows(untouched(each))] for each in words)
+    assert first[:2] == plain[:2]
+
+
+def rows(outcome: dict[str, bytes]) -> list[dict[str, str]]:
+    return list(csv.DictReader(outcome["episodes.csv"].decode().splitlines()))
+
+
 # --- the statistics beside the networks ---
 
 
