@@ -21,6 +21,7 @@ from acmr.config import ConfigError, ExperimentConfig
 from acmr.names import terminal
 from acmr.settings.compose import groups, launchers, options, setting_keys, sources, unknown_key
 from acmr.settings.files import place_of_key, place_of_text, wrong_kind
+from acmr.settings.validate import A_WRAPPER, WRAPPERS
 from acmr.text import flatten, message, without_userinfo
 
 #: Settings whose entries are free; Hydra adds to them with a plus sign only.
@@ -150,6 +151,8 @@ def _wrong_value(key: str, reason: str) -> str:
 def _wrong_type(override: str, error: BaseException) -> str:
     key, _, value = override.lstrip("+").partition("=")
     cause = str(error.__cause__ or "").strip().splitlines()
+    if key == WRAPPERS:
+        return f"{key}={value}: a list of wrappers is needed, each with its name and its arguments, as in {A_WRAPPER}"
     reason = cause[0] if cause else "is of another type"
     hint = ""
     if key in setting_keys() and re.fullmatch(r"[0-9.]+e[0-9]+|[0-9]+\.0*", value) and float(value).is_integer():

@@ -40,6 +40,8 @@ NO_USERINFO = (
     "an address with a user or a password, which would be stored with the run; leave them out "
     "(a W&B server's key is read from WANDB_API_KEY)"
 )
+#: A setting that is hard to guess, and how it is typed.
+WRAPPERS, A_WRAPPER = "env.wrappers", "'env.wrappers=[{name: FrameStackObservation, stack_size: 3}]'"
 #: No machine has more.
 MOST_THREADS = 4096
 #: Hidden layers; nobody learns with more.
@@ -139,10 +141,7 @@ def check_environment(config: EnvConfig) -> None:
     for wrapper in config.wrappers:
         name = wrapper.get("name")
         if not isinstance(name, str) or not name:
-            raise ConfigError(
-                f"env.wrappers={config.wrappers}: each needs its name, as in "
-                "'env.wrappers=[{name: FrameStackObservation, stack_size: 3}]'"
-            )
+            raise ConfigError(f"{WRAPPERS}={config.wrappers}: each needs its name, as in {A_WRAPPER}")
 
 
 def _check_impute(rule: str) -> None:
