@@ -68,7 +68,7 @@ report: paper-figures ## the same, and where the report lies
 	@echo "open results/$(PROFILE)/report.html"
 
 publish: $(READY) ## add the finished runs of PROFILE to results/, with networks and evaluations, to be committed
-	@python -m analysis.publish $(RUNS)/$(PROFILE) results/$(PROFILE)
+	@python -m analysis.publish $(RUNS)/$(PROFILE) results/$(PROFILE) $(ARGS)
 
 dashboard: $(READY) ## browse all runs in the terminal, offline
 	python -m acmr.tracking.mirror dashboard $(RUNS)/wandb

@@ -1,7 +1,13 @@
-"""A run's files as they go to others: without paths of this machine, and without what only showed the run there."""
+"""A run's files as they go to others: without paths of this machine, and without what only showed the run there.
+
+Where hundreds of runs go together, each is also made slim: a few kilobytes.
+"""
 
 from __future__ import annotations
 
+import csv
+import gzip
+import io
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -12,13 +18,20 @@ from acmr.foreign import parse_mapping
 from acmr.records import (
     CONFIG_FILE,
     DESCRIPTION_FILE,
+    EPISODE_COLUMNS,
+    EPISODES_FILE,
     EVALUATION_FILE,
+    SUMMARY_FILE,
     TRANSFER_FILE,
     description_sha256,
     portable,
     portable_settings,
 )
 
+#: What is kept of a slim run, beside the networks of those that took nothing.
+SLIM_RECORDS = (CONFIG_FILE, SUMMARY_FILE, EPISODES_FILE, TRANSFER_FILE)
+#: Digits of a return in it.
+DIGITS = 8
 _HASH = "description_sha256"
 
 
@@ -41,6 +54,22 @@ def portable_file(name: str, data: bytes) -> bytes:
     if name == CONFIG_FILE:
         return yaml.safe_dump(told, sort_keys=False).encode()
     return (json.dumps(told, indent=2) + "\n").encode()
+
+
+def slim_file(name: str, data: bytes) -> tuple[str, bytes]:
+    """Name and content of a file of a slim run: its episodes without what no measure needs, compressed.
+
+    Args:
+        name: One of ``SLIM_RECORDS``.
+        data: What it holds.
+    """
+    if name != EPISODES_FILE:
+        return name, data
+    lines = [",".join(EPISODE_COLUMNS)]
+    for row in csv.DictReader(io.StringIO(data.decode())):
+        step, value, length = (row[column] for column in EPISODE_COLUMNS)
+        lines.append(f"{step},{float(value):.{DIGITS}g},{length}")
+    return f"{name}.gz", gzip.compress(("\n".join(lines) + "\n").encode(), mtime=0)
 
 
 def _told(name: str, content: Mapping[str, Any]) -> dict[str, Any]:

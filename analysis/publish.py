@@ -21,7 +21,7 @@ from typing import Any
 
 from acmr.cells import CELLS
 from acmr.command import command, typed
-from acmr.config import THRESHOLD
+from acmr.config import THRESHOLD, TransferConfig
 from acmr.foreign import is_there, read_bytes, read_mapping
 from acmr.names import terminal
 from acmr.records import (
@@ -42,7 +42,7 @@ from acmr.records import (
 from acmr.run_folders import changes, run_folders, sealed
 from acmr.text import size
 from analysis.evaluations import adds_up
-from analysis.portable import portable_file
+from analysis.portable import SLIM_RECORDS, portable_file, slim_file
 
 #: A table above this is compressed; networks above it are published in half precision, unless students learn from them.
 LARGE = 1_000_000
@@ -78,7 +78,9 @@ class Published:
 def _silent(line: str) -> None: ...
 
 
-def publish(runs: Path, out: Path, say: Callable[[str], None] = _silent, trust: bool = False) -> Published:
+def publish(
+    runs: Path, out: Path, say: Callable[[str], None] = _silent, trust: bool = False, small: bool = False
+) -> Published:
     """Copies the records of every run that has come to its end, and the networks with an evaluation of those complete.
 
     Args:
@@ -86,6 +88,8 @@ def publish(runs: Path, out: Path, say: Callable[[str], None] = _silent, trust: 
         out: Folder that they are added to, under the same names.
         say: Told of every evaluation before it is made, for it takes a while.
         trust: Whether an evaluation may run the code that a run's own files name.
+        small: Whether to keep a few kilobytes of each run (:mod:`analysis.portable`): of its episodes what measures
+            need, no metrics, no evaluation, and networks, in half precision, only of runs that took nothing.
 
     Raises:
         PublishError: If there is nothing to publish, ``out`` holds other results of a run, or it would become too
@@ -96,7 +100,7 @@ def publish(runs: Path, out: Path, say: Callable[[str], None] = _silent, trust: 
         found = {
             path.relative_to(runs): files
             for path in folders
-            if (files := _files(path, out / path.relative_to(runs), Path(scratch)))
+            if (files := _files(path, out / path.relative_to(runs), Path(scratch), small))
         }
     if not found:
         raise PublishError(f"{runs}: no run has come to its end there; make status says how far they are")
@@ -113,12 +117,12 @@ def publish(runs: Path, out: Path, say: Callable[[str], None] = _silent, trust: 
         (out / run).mkdir(parents=True, exist_ok=True)
         for name in names:
             _write(out / run / name, found[run][name])
-        evaluated = _evaluate(runs / run, out / run, say, done.left_out, trust)
+        evaluated = not small and _evaluate(runs / run, out / run, say, done.left_out, trust)
         (done.added if names or evaluated else done.there).append(out / run)
     return done
 
 
-def _files(run: Path, target: Path, scratch: Path) -> dict[str, bytes]:
+def _files(run: Path, target: Path, scratch: Path, small: bool) -> dict[str, bytes]:
     """Names and contents of what is published of a run, but for its evaluation; nothing if it has not ended."""
     try:
         summary = read_mapping(run / SUMMARY_FILE)
@@ -128,11 +132,13 @@ def _files(run: Path, target: Path, scratch: Path) -> dict[str, bytes]:
         return {}
     if changed := changes(run, summary):
         raise PublishError(f"{run}: {'; '.join(changed.values())}; put back what the run wrote, or make it anew")
-    files = dict(_packed(run / name) for name in RECORDS if is_there(run / name))
+    records = SLIM_RECORDS if small else RECORDS
+    files = dict(_packed(run / name, small) for name in records if is_there(run / name))
     files[SUMMARY_FILE] = _resealed(summary, files)
     # The networks of a run that diverged are of no use.
-    if ended_state(summary) == COMPLETE and all(is_there(run / name) for name in NETWORKS):
-        is_full = _teaches(summary) or len(_portable(run / TENSOR_FILE)) <= LARGE
+    usable = ended_state(summary) == COMPLETE and (not small or summary.get("transfer") == TransferConfig().name)
+    if usable and all(is_there(run / name) for name in NETWORKS):
+        is_full = not small and (_teaches(summary) or len(_portable(run / TENSOR_FILE)) <= LARGE)
         source = run if is_full else _halved(run, target, scratch)
         files |= {name: _portable(source / name) for name in NETWORKS}
     return files
@@ -143,7 +149,7 @@ def _resealed(summary: dict[str, Any], files: dict[str, bytes]) -> bytes:
     if FILES_ENTRY not in summary:
         return files[SUMMARY_FILE]
     digests = {}
-    for name in SEALED_FILES:
+    for name in (name for name in SEALED_FILES if name in files or f"{name}.gz" in files):
         data = files[name] if name in files else gzip.decompress(files[f"{name}.gz"])
         digests[name] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     if digests == summary[FILES_ENTRY]:
@@ -224,8 +230,10 @@ def _check_size(out: Path, runs: Path, more: int) -> None:
         )
 
 
-def _packed(path: Path) -> tuple[str, bytes]:
+def _packed(path: Path, small: bool) -> tuple[str, bytes]:
     data = _portable(path)
+    if small:
+        return slim_file(path.name, data)
     if path.suffix != ".csv" or len(data) <= LARGE:
         return path.name, data
     return f"{path.name}.gz", gzip.compress(data, mtime=0)
@@ -274,9 +282,10 @@ def main() -> int:
     parser.add_argument("runs", type=Path, help="folder of runs, as runs/paper")
     parser.add_argument("out", type=Path, help="where they are added, as results/paper")
     parser.add_argument("--trust", action="store_true", help="run code that the runs' own files name, to evaluate them")
-    arguments = parser.parse_args()
+    parser.add_argument("--small", action="store_true", help="keep a few kilobytes of each run")
+    given = parser.parse_args()
     try:
-        done = publish(arguments.runs, arguments.out, _print, arguments.trust)
+        done = publish(given.runs, given.out, _print, given.trust, given.small)
         print("\n".join(map(terminal, _report(done))))
     except (OSError, ValueError) as error:
         print(terminal(f"analysis.publish: {error}"), file=sys.stderr)
