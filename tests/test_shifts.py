@@ -6,12 +6,16 @@ import re
 
 import pytest
 import yaml
+from hydra import compose, initialize_config_dir
 
 from acmr.envs import describe
-from acmr.settings.compose import CONFIG_FOLDER, environment_config
+from acmr.settings.compose import CONFIG_FOLDER, environment_config, register_schema
 from acmr.settings.run_spec import teacher_spec
 from acmr.transfer.name_map import map_bodies
+from docs.shifts import runs
+from sweeps.estimate import estimate
 from sweeps.plan import expand, make_plan
+from sweeps.screen.display import print_plan
 
 #: Of each environment the sensors and the actuators that differ from its teacher's, and whether they are lost.
 SHIFTS = {
@@ -57,6 +61,20 @@ def test_each_environment_has_lost_or_gained_what_its_name_says(lost):
     assert differing(lost, added(lost)) == [set(), set(), sensors, actuators]
 
 
+def test_the_matrix_is_whole_pairs_with_every_method_and_ten_seeds():
+    register_schema()
+    with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
+        composed = compose("config", ["matrix=shifts"], return_hydra_config=True)
+    params = composed.hydra.sweeper.params
+    assert (composed.profile, composed.tracking.tracker) == ("shifts", None)
+    # Both directions of a robot, in the order of the page.
+    swept = [each for lost in SHIFTS for each in (lost, added(lost)) if lost in params["env"]]
+    assert params["env"].replace(" ", "").split(",") == swept
+    assert (params["experiment"], params["seed"]) == (",".join(METHODS), "range(1,11)")
+    assert tuple(METHODS) == tuple(runs.METHODS)
+    assert [each for lost in SHIFTS for each in (lost, added(lost))] == list(runs.PAIRS)
+
+
 def test_runs_of_one_shift_have_directories_of_their_own_and_the_values_of_their_profile(tmp_path):
     jobs = [["profile=shifts", "env=hopper_sensors_failed", f"experiment={cell}", "seed=3"] for cell in METHODS]
     specs = expand(jobs)
@@ -72,7 +90,7 @@ def test_runs_of_one_shift_have_directories_of_their_own_and_the_values_of_their
 
 
 @pytest.mark.parametrize("lost", ["hopper_sensors_failed"])
-def test_a_baseline_is_the_teacher_of_the_other_direction_and_trained_once(lost, tmp_path):
+def test_a_baseline_is_the_teacher_of_the_other_direction_and_trained_once(lost, tmp_path, capsys):
     out = f"output_dir={tmp_path}"
     jobs = [
         [out, "profile=shifts", f"env={env}", f"experiment={cell}", "seed=1"]
@@ -92,6 +110,8 @@ def test_a_baseline_is_the_teacher_of_the_other_direction_and_trained_once(lost,
     # Of one direction alone it is the same run.
     alone = make_plan(expand(jobs[2:]))
     assert [run.spec.name for run in alone.runs if run.teacher is None] == [f"{lost}-none", "whole_hopper-none"]
+    print_plan(alone, estimate(alone, tmp_path, 1), 1, tmp_path)
+    assert f"whole_hopper-none/seed_1  (the same body: stands for {added(lost)}-none)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("word", ["agent.tau=0.01", "env.max_episode_steps=100", "stop=threshold"])

@@ -82,8 +82,10 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for method, told in STEPS.items():
         for seed, met in enumerate(told, start=1):
             write(root, LOST, method, seed, met, early=110.0 if method == "N1" else 10.0)
+    # The last is a pilot, and none of what is told.
+    for seed in (1, 2, 3, 101):
+        write(root, WHOLE, "A0", seed, 4000 + 100 * seed if seed < 100 else 1000)
     for seed in (1, 2, 3):
-        write(root, WHOLE, "A0", seed, 4000 + 100 * seed)
         write(root, ADDED, "N1", seed, 1000)
     with (root / ZERO_SHOT).open("w") as file:
         rows = [[LOST, method, seed, 10, 10.0] for method in STEPS for seed in range(1, 11)]
@@ -165,7 +167,7 @@ def test_tables_tell_the_numbers(found, beside, monkeypatch):
 def test_the_published_runs_tell_the_same_in_a_few_kilobytes(root, found, tmp_path):
     out = tmp_path / "results" / "shifts"
     done = publish(root, out, small=True)
-    assert len(done.added) == 56
+    assert len(done.added) == 57
     (out / ZERO_SHOT).write_bytes((root / ZERO_SHOT).read_bytes())
     ours, theirs = (each.runs.drop(columns="run") for each in (read(out), found))
     pd.testing.assert_frame_equal(ours, theirs, rtol=1e-7)
@@ -215,10 +217,15 @@ def test_a_threshold_is_the_median_level_rounded_down_to_two_digits(levels, told
     assert threshold(levels) == told
 
 
-def test_thresholds_are_those_of_the_pilots():
+def test_thresholds_are_those_of_the_pilots_and_the_matrix_has_the_pairs_whose_bodies_have_one():
     settled = {body: threshold(levels) for body, levels in pilots().items() if len(levels) == 3}
     said = {path.stem: yaml.safe_load(path.read_text()) for path in (ROOT / "conf" / "env").glob("*.yaml")}
     assert {name: content["threshold"] for name, content in said.items() if "threshold" in content} == settled
+    matrix = yaml.safe_load((ROOT / "sweeps" / "matrix" / "shifts.yaml").read_text())
+    for pair in matrix["hydra"]["sweeper"]["params"]["env"].replace(" ", "").split(","):
+        config = environment_config(pair)
+        bodies = {pair if pair in settled else environment_config(config.source).source, config.source}
+        assert bodies <= settled.keys()
 
 
 @pytest.mark.slow

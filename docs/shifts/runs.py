@@ -34,6 +34,8 @@ PAIRS = (
     *("halfcheetah_motor_failed", "halfcheetah_motor_added", "hopper_sensors_failed", "hopper_sensors_added"),
     *("humanoid_arm_lost", "humanoid_arm_added"),
 )
+#: Seeds that every method of every pair is to have; others are pilots, on which something was chosen.
+PLANNED = range(1, 11)
 #: Part of the budget whose episodes tell the return at a tenth of it.
 EARLY = (0.05, 0.1)
 #: Beside the runs: what each policy returns before any learning (:mod:`docs.shifts.play`).
@@ -74,9 +76,9 @@ class Benchmark:
 
 
 def read(root: Path) -> Benchmark:
-    """Reads all runs below a folder, as ``results/shifts``."""
+    """Reads the runs below a folder, as ``results/shifts``, that are planned."""
     data = load(root)
-    counted = data.runs[data.runs["counted"]]
+    counted = data.runs[data.runs["counted"] & data.runs["seed"].isin(PLANNED)]
     episodes = {str(name): frame for name, frame in data.episodes.groupby("run", observed=True)}
     played = _played(root / ZERO_SHOT)
     bodies = {str(run["env"]): _body(data.configs[str(name)]) for name, run in counted.iterrows()}

@@ -15,11 +15,9 @@ from analysis.statistics.study.aggregates import improvement, iqm, stratified_in
 from analysis.statistics.two_samples import holm, permutation_p
 from docs.markdown import number, p_value, span, table
 from docs.shifts.pilots import SEEDS, pilots
-from docs.shifts.runs import BASELINE, METHODS, ROOT, Benchmark
+from docs.shifts.runs import BASELINE, METHODS, PLANNED, ROOT, Benchmark
 
 PAGE = ROOT / "docs" / "shifts.md"
-#: Seeds that every method of every pair is to have.
-PLANNED = range(1, 11)
 
 
 def tables(found: Benchmark) -> dict[str, str]:

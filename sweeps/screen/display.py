@@ -179,6 +179,8 @@ def _remark(run: PlannedRun) -> str:
         # A run that no other stands for is not full because of this one.
         full = "in full, " if any(stops(name) for name in run.stands_for) else ""
         why = f"{full}and there" if run.ended else f"{full}since it teaches"
+        if not all(name.startswith(f"{run.spec.config.env.name}-") for name in run.stands_for):
+            why = "the same body"
         return f"  ({why}: stands for {', '.join(run.stands_for)})"
     return "  (added: the teacher of runs below)" if run.implied else ""
 
