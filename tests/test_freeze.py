@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from test_config import refusal, spec
 
 from acmr.agent.fine_tuning import thaw_schedule
-from acmr.cells import cell_of
+from acmr.cells import CELLS
 from acmr.settings import compose
 from acmr.settings.command_line import hydra_arguments
 from acmr.settings.compose import options
@@ -69,8 +70,12 @@ def test_a_choice_means(words, freeze, thaw, name):
 
 def test_true_and_false_are_the_cells_that_they_were_and_others_none():
     assert [spec("experiment=A1", f"freeze={choice}").cell for choice in options("freeze")] == ["A1", None, "A2"]
-    # One of one's own is a row with the steps among its changes.
-    assert cell_of("target", "hidden", True, {"thaw": GRADUAL}) is None
+
+
+def test_a_cell_of_ones_own_may_thaw(monkeypatch):
+    row = replace(CELLS["A2"], name="A6", changes={"thaw": GRADUAL}, published=False)
+    monkeypatch.setitem(CELLS, "A6", row)
+    assert [spec("experiment=A2", f"freeze={choice}").cell for choice in options("freeze")] == ["A1", "A6", "A2"]
 
 
 def test_a_run_that_was_stored_before_there_was_thawing_reads_as_it_was():

@@ -67,6 +67,12 @@ class Formula:
         return 1000 * (math.log10(float(said["agent.q_lr"])) + 2) ** 2 + 10 * int(said["seed"])
 
 
+def test_a_choice_that_hydra_takes_quoted_only_is_one_of_its_names():
+    space = spaced("transfer=hidden", "freeze='true','false',gradual")
+    assert space.choices["freeze"].choices == ("true", "false", "gradual")
+    assert space.job({"freeze": "true"}, 1) == ["transfer=hidden", "freeze=true", "seed=1"]
+
+
 def test_words_become_what_optuna_chooses_from():
     space = spaced(
         RATE, "agent.tau=interval(0.1,0.5)", "agent.gamma=tag(log,interval(0.9,0.99))",

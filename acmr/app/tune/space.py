@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
+from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, QuotedString, RangeSweep
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 
 from acmr.command import typed
@@ -105,7 +105,9 @@ def _seeds(override: Override) -> tuple[int, ...]:
 def _values(override: Override) -> list[Any]:
     check_counts([override])
     values = []
-    for entry in override.sweep_iterator():
+    for given in override.sweep_iterator():
+        # As freeze='true' is typed to Hydra.
+        entry = given.text if isinstance(given, QuotedString) else given
         if not isinstance(entry, str | int | float | bool | None):
             raise ConfigError(f"{override.input_line}: values to choose from are numbers and words, not {entry}")
         values.append(entry)
