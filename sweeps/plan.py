@@ -192,7 +192,11 @@ def _twin(spec: RunSpec) -> RunSpec | None:
     env = spec.config.env
     if spec.config.transfer.rules.needs_teacher or env.source == env.name:
         return None
-    twin = teacher_spec(teacher_spec(spec.config).config)
+    try:
+        twin = teacher_spec(teacher_spec(spec.config).config)
+    except ConfigError:
+        # There is no such environment, and nobody who takes nothing needs it.
+        return None
     named = replace(env, name=twin.config.env.name, source=twin.config.env.source)
     known = {key: getattr(spec.config, key) for key in (*_SHARED_KEYS, "force", "metric")}
     twin = replace(twin, config=replace(twin.config, **known))

@@ -114,7 +114,9 @@ def test_a_baseline_is_the_teacher_of_the_other_direction_and_trained_once(lost,
     assert f"whole_hopper-none/seed_1  (the same body: stands for {added(lost)}-none)" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("word", ["agent.tau=0.01", "env.max_episode_steps=100", "stop=threshold"])
+@pytest.mark.parametrize(
+    "word", ["agent.tau=0.01", "env.max_episode_steps=100", "stop=threshold", "env.source=nowhere"]
+)
 def test_a_baseline_with_settings_of_its_own_is_a_run_of_its_own(word, tmp_path):
     job = [f"output_dir={tmp_path}", "profile=shifts", "env=hopper_sensors_added", "experiment=A0", word]
     assert [run.spec.config.env.name for run in make_plan(expand([job])).runs] == ["hopper_sensors_added"]

@@ -109,7 +109,7 @@ def test_a_run_is_measured_as_by_hand(found):
     first, last = found.of(LOST, "A0").iloc[[0, -1]].to_dict("records")
     assert (first["steps"], first["reached"], last["steps"], last["reached"]) == (6000.0, True, 10_000.0, False)
     # Five episodes end from step 501 to step 1000.
-    assert first["early"] == pytest.approx(10 + np.mean([600, 700, 800, 900, 1000]) / 1e7)
+    assert first["early"] == pytest.approx(10 + np.mean([600, 700, 800, 900, 1000]) / 1e7, rel=1e-9)
     assert (first["final"], first["zero_shot"]) == (THRESHOLD + 0.25, 10.0)
 
 
