@@ -1,8 +1,9 @@
 """The directory of a sweep: its plan and settings as they were at its start, and the state of each run.
 
 ``<output_dir>/.sweeps/<id>/`` holds ``plan.json``, the runs' settings (``jobs``), a copy of ``conf``, the state of each
-run (``states``), which were begun anew in it (``begun``) and, once the sweep is to stop, ``stop``. What cannot be read
-stops nobody: a state counts as waiting, the plan of a sweep that is over is set aside. Free of Hydra, to start quickly.
+run (``states``), which were begun anew in it (``begun``) or are wanted no more (``withdrawn``), ``open`` while more may
+come and, once the sweep is to stop, ``stop``. What cannot be read stops nobody: a state counts as waiting, the plan
+of a sweep that is over is set aside. Free of Hydra, to start quickly.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from acmr.records import DamagedError
+from acmr.records import STOPPED, DamagedError
 from acmr.storage.durable import WriteError, read_regular
 from acmr.storage.json_files import write_json
 from acmr.storage.processes import is_alive
-from sweeps.state import STATES, State, SweepRun, read_run
+from sweeps.state import STATES, WAITING, WITHDRAWN, State, SweepRun, read_run
 
 SWEEPS = ".sweeps"
 #: What a training printed, in its run's directory.
@@ -64,7 +65,7 @@ class SweepFolder:
         """
         identity = f"{time.strftime('%Y%m%d-%H%M%S')}-{time.time_ns() // 1000 % 1_000_000:06}"
         folder = cls((output_dir / SWEEPS / identity).absolute())
-        for name in ("jobs", "states", "claims", "begun"):
+        for name in ("jobs", "states", "claims", "begun", "withdrawn"):
             (folder.path / name).mkdir(parents=True)
         shutil.copytree(conf, folder.conf)
         folder._hold()
@@ -103,6 +104,21 @@ class SweepFolder:
             DamagedError: If the plan cannot be read, or has something else in their place.
         """
         return [read_run(self.path / _PLAN, index, run) for index, run in enumerate(self.header()["runs"])]
+
+    def extend(self, entries: Sequence[SweepRun], order: Sequence[int]) -> None:
+        """Stores the plan anew, with runs that came after those that it had.
+
+        Args:
+            entries: All runs, the former ones first.
+            order: Those to train.
+        """
+        content = {**self.header(), "order": list(order), "runs": [asdict(entry) for entry in entries]}
+        write_json(self.path / _PLAN, content)
+        self._plan = content
+
+    def reload(self) -> None:
+        """Forgets the plan, so that it is read again."""
+        self._plan = None
 
     def is_alive(self) -> bool:
         """Whether its process is still there."""
@@ -145,6 +161,12 @@ class SweepFolder:
 
     def state(self, index: int) -> State:
         """What has become of a run; it waits where nothing is said that can be read."""
+        found = self._stored_state(index)
+        # A worker that has it stops it first, and says so.
+        withdrawn = found.state in (WAITING, STOPPED) and self.is_withdrawn(index)
+        return State(WITHDRAWN, found.failures, "stopped on purpose") if withdrawn else found
+
+    def _stored_state(self, index: int) -> State:
         with suppress(DamagedError):
             said = _read(self._state_file(index))
             state, failures, reason = said.get("state"), said.get("failures"), said.get("reason")
@@ -158,6 +180,27 @@ class SweepFolder:
 
     def _state_file(self, index: int) -> Path:
         return self.path / "states" / f"{index:05d}.json"
+
+    def withdraw(self, index: int) -> None:
+        """Says that a run is wanted no more: its worker stops it as at the end of the sweep, and none takes it up."""
+        (self.path / "withdrawn" / f"{index:05d}").touch()
+
+    def readmit(self, index: int) -> None:
+        """Says that it is wanted again."""
+        (self.path / "withdrawn" / f"{index:05d}").unlink(missing_ok=True)
+
+    def is_withdrawn(self, index: int) -> bool:
+        """Whether a run is wanted no more."""
+        return (self.path / "withdrawn" / f"{index:05d}").exists()
+
+    def keep_open(self, more: bool) -> None:
+        """Says whether more runs may come, for which workers wait."""
+        (self.path / "open").touch() if more else (self.path / "open").unlink(missing_ok=True)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether more runs may come."""
+        return (self.path / "open").exists()
 
     @contextmanager
     def claim(self, index: int) -> Iterator[bool]:

@@ -9,11 +9,12 @@ from typing import Any
 
 from acmr.records import ENDED, FAILED, RUNNING, STOPPED, DamagedError
 
-#: State of a run of a sweep, beside those that it says itself.
-WAITING = "waiting"
+#: States of a run of a sweep, beside those that it says itself: nobody has taken it up; it is wanted no more.
+WAITING, WITHDRAWN = "waiting", "withdrawn"
+#: What is stored; that a run is withdrawn follows from a file of its own, which a worker does not write over.
 STATES = (WAITING, RUNNING, STOPPED, *ENDED, FAILED)
-#: States that a run does not leave within its sweep.
-FINAL = (*ENDED, FAILED)
+#: States that a run does not leave within its sweep, unless it is wanted again.
+FINAL = (*ENDED, FAILED, WITHDRAWN)
 #: Fields of a run that are words, all others are numbers.
 _TEXTS = ("name", "cell", "directory", "ended")
 
@@ -50,7 +51,7 @@ class State:
     """What has become of a run within its sweep.
 
     Attributes:
-        state: ``waiting``, ``running``, ``complete``, ``diverged``, ``failed`` or ``stopped``.
+        state: ``waiting``, ``running``, ``complete``, ``diverged``, ``failed``, ``stopped`` or ``withdrawn``.
         failures: How often it failed.
         reason: Why it failed or waits, in one line.
     """

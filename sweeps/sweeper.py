@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,8 +73,18 @@ def run_sweep(jobs: Sequence[Sequence[str]], settings: Settings, config: DictCon
     return train_plan(make_plan(specs), Path(specs[0].config.output_dir), settings, config, context)
 
 
-def train_plan(plan: Plan, output_dir: Path, settings: Settings, config: DictConfig, context: HydraContext) -> int:
-    """Trains what is missing of a plan whose runs lie in a folder; the rest as :func:`run_sweep`."""
+def train_plan(
+    plan: Plan,
+    output_dir: Path,
+    settings: Settings,
+    config: DictConfig,
+    context: HydraContext,
+    make: Callable[[Plan, Path, Settings, LauncherAdapter], Sweep] | None = None,
+) -> int:
+    """Trains what is missing of a plan whose runs lie in a folder, by the sweep that ``make`` makes.
+
+    The rest as :func:`run_sweep`.
+    """
     threads = max(run.spec.config.threads for run in plan.runs)
     adapter = make_adapter(config, context, threads, settings.workers)
     workers = max(1, min(adapter.workers, len(plan.missing)))
@@ -85,9 +95,9 @@ def train_plan(plan: Plan, output_dir: Path, settings: Settings, config: DictCon
         print(f"{len(plan.runs)} of {len(plan.runs)} runs complete: {_places(plan)}")
         return 0
     folders = all_folders(output_dir, lambda line: print(line, file=sys.stderr))
-    _refuse_overlap(plan, output_dir, folders)
+    refuse_overlap(plan, output_dir, folders)
     adapter.clear(folders)
-    return Sweep(plan, output_dir, settings, adapter).run()
+    return (make or Sweep)(plan, output_dir, settings, adapter).run()
 
 
 class Sweep:
@@ -109,10 +119,10 @@ class Sweep:
             "retries": settings.retries,
             "grace": settings.grace,
         }
-        self._entries = entries_of(plan, output_dir)
+        self._entries, self._order = entries_of(plan, output_dir), plan.order
         try:
             main = sources().main or CONFIG_FOLDER
-            self._folder = SweepFolder.create(output_dir, header, self._entries, plan.order, main)
+            self._folder = SweepFolder.create(output_dir, header, self._entries, self._order, main)
             sources().store(self._folder.path, self._folder.conf)
             for run in plan.missing:
                 write_job(self._folder.job_file(run.index), run.spec)
@@ -152,7 +162,7 @@ class Sweep:
 
     def _launch_all(self, display: Display) -> None:
         number = fruitless = 0
-        while self._signal is None and (runs := self._to_launch()):
+        while self._tend() and self._signal is None and (runs := self._to_launch()):
             before = [self._state(index) for index in runs]
             launch = Launch(self._adapter, self._folder, runs, number)
             self._await(launch, display)
@@ -169,11 +179,16 @@ class Sweep:
                 display.say(f"error: the launcher starts no jobs{why}")
                 return
 
+    def _tend(self) -> bool:
+        """Called again and again while runs are trained; whether to go on launching. See :mod:`sweeps.growing`."""
+        return True
+
     def _await(self, launch: Launch, display: Display) -> None:
         deadline, quiet = float("inf"), 0
         while not launch.is_over(_GLANCE):
             display.tick()
             if self._signal is None:
+                self._tend()
                 continue
             if deadline == float("inf"):
                 deadline = time.monotonic() + self._settings.grace + _MARGIN
@@ -186,7 +201,7 @@ class Sweep:
         self._abandoned = self._abandoned or launch.is_waiting
 
     def _is_training(self) -> bool:
-        return any(self._folder.state(index).state == RUNNING for index in self._plan.order)
+        return any(self._folder.state(index).state == RUNNING for index in self._order)
 
     def _state(self, index: int) -> State:
         ended = self._entries[index].ended
@@ -195,7 +210,7 @@ class Sweep:
     def _to_launch(self) -> list[int]:
         """The runs that a launch may train, in order; without the students of teachers that failed."""
         found = []
-        for index in self._plan.order:
+        for index in self._order:
             teacher = self._entries[index].teacher
             taught = COMPLETE if teacher is None else self._state(teacher).state
             possible = taught == COMPLETE or (self._adapter.workers_pick_runs and taught not in FINAL)
@@ -205,7 +220,7 @@ class Sweep:
 
     def _settle(self) -> None:
         """After a launch nothing runs: a run that still says so was lost with its worker or its cluster job."""
-        for index in self._plan.order:
+        for index in self._order:
             state = self._folder.state(index)
             if state.state == RUNNING:
                 # On this machine one lost worker takes its siblings along, so that it is no fault of the run.
@@ -240,8 +255,12 @@ def _check(settings: Settings) -> None:
         raise ConfigError(f"hydra.sweeper.grace={settings.grace}: a number of seconds is needed")
 
 
-def _refuse_overlap(plan: Plan, output_dir: Path, folders: Sequence[SweepFolder]) -> None:
-    """Two sweeps on the same runs would only wait for one another."""
+def refuse_overlap(plan: Plan, output_dir: Path, folders: Sequence[SweepFolder]) -> None:
+    """Refuses runs that are on their way in another sweep: the two would only wait for one another.
+
+    Raises:
+        ConfigError: If there is such a one.
+    """
     wanted = {entry.directory for entry in entries_of(plan, output_dir) if entry.ended is None}
     for folder in folders:
         common = [entry for entry in folder.entries() if entry.directory in wanted and entry.ended is None]

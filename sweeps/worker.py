@@ -42,9 +42,12 @@ def work(cfg: DictConfig) -> None:
             worker must not outlive, or 0.
     """
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
-    worker = Worker(SweepFolder(Path(cfg.sweep)), int(cfg.parent))
+    folder = SweepFolder(Path(cfg.sweep))
+    worker = Worker(folder, int(cfg.parent))
     if cfg.run == NEXT:
-        worker.take_next()
+        # There are as many jobs as runs; where more may come, there are as many as workers.
+        while worker.take_next() and folder.is_open:
+            pass
     else:
         worker.take(int(cfg.run))
     if worker.is_orphan():
@@ -62,8 +65,11 @@ class Worker:
 
     def __init__(self, folder: SweepFolder, parent: int) -> None:
         self._folder, self._parent = folder, parent
+        self._read_plan()
+
+    def _read_plan(self) -> None:
         try:
-            header, self._entries = folder.header(), folder.entries()
+            header, self._entries = self._folder.header(), self._folder.entries()
         except DamagedError as error:
             raise ConfigError(f"{error}; start the sweep's command again") from error
         self._order: list[int] = [index for index in header["order"] if index in range(len(self._entries))]
@@ -76,7 +82,12 @@ class Worker:
             Whether there was one.
         """
         while not self._is_over():
-            promising = False
+            # Asked first: a run that comes after this look is found at the next one. A sweep that was killed leaves its
+            # mark, and a worker of another machine does not see its process.
+            promising = self._folder.is_open and self._folder.is_alive()
+            if promising:
+                self._folder.reload()
+                self._read_plan()
             for index in self._order:
                 if self._state(index).state in FINAL:
                     continue
@@ -111,8 +122,10 @@ class Worker:
         teacher = self._entries[index].teacher
         return teacher is not None and self._state(teacher).state not in FINAL
 
-    def _is_over(self) -> bool:
-        return self._folder.stopping or self.is_orphan()
+    def _is_over(self, index: int | None = None) -> bool:
+        """Whether the sweep is to stop, or one of its runs is."""
+        withdrawn = index is not None and self._folder.is_withdrawn(index)
+        return withdrawn or self._folder.stopping or self.is_orphan()
 
     def is_orphan(self) -> bool:
         """Whether the process that it works for has gone."""
@@ -122,8 +135,8 @@ class Worker:
         state, held_since = self._folder.state(index), time.monotonic()
         while state.failures <= self._retries:
             self._folder.set_state(index, replace(state, state=RUNNING))
-            code, words = self._attempt(self._entries[index])
-            outcome = self._outcome(index, code)
+            code, words, told = self._attempt(self._entries[index])
+            outcome = self._outcome(index, code, told)
             if outcome in (*ENDED, STOPPED):
                 self._folder.set_state(index, replace(state, state=outcome, reason=""))
                 return
@@ -142,28 +155,30 @@ class Worker:
             if final or (bound and code in _ENDED_FROM_OUTSIDE):
                 return
 
-    def _attempt(self, entry: SweepRun) -> tuple[int, str]:
+    def _attempt(self, entry: SweepRun) -> tuple[int, str, bool]:
+        """Trains once; returns the exit code, the last words, and whether the training was told to stop."""
         run_dir = self._folder.output_dir / entry.directory
         try:
             training = TrainingProcess(self._folder.job_file(entry.index), run_dir / OUTPUT_FILE, entry.threads)
         except OSError as error:
-            return REFUSED, f"{error.filename or run_dir}: {error.strerror or error}"
+            return REFUSED, f"{error.filename or run_dir}: {error.strerror or error}", False
         try:
-            while (code := training.wait()) is None and not self._is_over():
+            while (code := training.wait()) is None and not self._is_over(entry.index):
                 pass
+            told = code is None
         finally:
             # Also when Slurm takes this job's time away, which ends this function by an exception.
             code = training.stop(self._grace, lambda: self._folder.killing)
-        return code, training.last_words()
+        return code, training.last_words(), told
 
-    def _outcome(self, index: int, code: int) -> str:
+    def _outcome(self, index: int, code: int, told: bool) -> str:
         if code == 0 or code == NUMBERS_DIVERGED:
             with suppress(ConfigError):
                 summary = RunDir(self._folder.output_dir / self._entries[index].directory).summary()
                 status = (summary or {}).get("status")
                 return str(status) if status in ENDED else FAILED
             return FAILED
-        return STOPPED if self._is_over() else FAILED
+        return STOPPED if told or self._is_over(index) else FAILED
 
 
 _ENDED_FROM_OUTSIDE = (-signal.SIGTERM, 128 + signal.SIGTERM, 128 + signal.SIGINT)

@@ -1,70 +1,23 @@
 """Searches with the real Optuna: against a formula whose least value is known, and as users start them."""
 
-import math
-import os
 import re
 import signal
-import subprocess
 import sys
-import time
+import warnings
 
 import pytest
-from guides import ROOT
+from searches import RATE, TINY, Formula, parsed, reports, searched, spaced
 from test_export import needs
 
 from acmr.config import ConfigError
 
-TINY = [
-    "env=gym", "env.id=Pendulum-v1", "env.max_episode_steps=50", "profile=quick", "total_timesteps=300",
-    "agent.learning_starts=100", "agent.hidden_sizes=[8]", "tracking=off",
-]  # fmt: skip
 #: Optuna is an extra, which is there where the slow tests run.
 pytestmark = pytest.mark.slow
-RATE = "agent.q_lr=interval(1e-4,1e-1)"
 
 
 @pytest.fixture(autouse=True)
 def _optuna():
     needs("optuna")
-
-
-def parsed(*words: str):
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
-    return OverridesParser.create().parse_overrides(list(words))
-
-
-def spaced(*words: str):
-    from acmr.app.tune.space import make_space
-
-    return make_space(parsed(*words))
-
-
-def searched(folder, space, trials: int, prune: bool = True, workers: int = 2, train=None):
-    """A search whose runs are worth what a formula says, or a function of the jobs."""
-    from acmr.app.tune.search import Search, Wanted
-    from sweeps.sweeper import Settings
-
-    folder.mkdir(exist_ok=True)
-    search = Search(folder, space, "steps_to_threshold", Wanted(trials, None, prune, Settings(False, 0, 1, 1)), workers)
-    search.trainings = train or Formula()
-    return search
-
-
-class Formula:
-    """Stands in for trainings: least at q_lr = 1e-2, and worth as much more as the seed is greater."""
-
-    def __init__(self):
-        self.jobs = []
-
-    def train(self, jobs):
-        self.jobs += jobs
-        return [self.value(job) for job in jobs], 0
-
-    @staticmethod
-    def value(job):
-        said = dict(word.split("=") for word in job)
-        return 1000 * (math.log10(float(said["agent.q_lr"])) + 2) ** 2 + 10 * int(said["seed"])
 
 
 def test_a_choice_that_hydra_takes_quoted_only_is_one_of_its_names():
@@ -130,30 +83,48 @@ def test_what_cannot_be_searched(words, says):
     ],
 )
 def test_what_no_trial_could_run_is_refused_before_the_first(words, says):
-    from acmr.app.tune.search import _try_out
+    from acmr.app.tune.study import try_out
     from acmr.settings.errors import USER_ERRORS, explain
 
     with pytest.raises(USER_ERRORS) as caught:
-        _try_out(spaced(*TINY, *words), parsed(*TINY, *words))
+        try_out(spaced(*TINY, *words), parsed(*TINY, *words))
     assert says in explain(caught.value)
 
 
 def test_it_finds_what_is_best_and_cuts_short_what_is_not(tmp_path, capsys):
     space = spaced(RATE, "seed=1,2,3")
-    search = searched(tmp_path / "it", space, trials=40, workers=3)
-    assert search.run() == 0
+    search = searched(tmp_path / "it", space, trials=24, workers=3)
+    with warnings.catch_warnings():
+        # Optuna warns of a value for a step that has one.
+        warnings.simplefilter("error")
+        assert search.run() == 0
     study, jobs = search._study, search.trainings.jobs
     assert study.best_params["agent.q_lr"] == pytest.approx(1e-2, rel=0.3)
     assert study.best_value == pytest.approx(Formula.value(space.job(study.best_params, 2)))
     states = [trial.state.name for trial in study.trials]
-    assert (len(states), states.count("FAIL")) == (40, 0)
-    assert states.count("PRUNED") > 3
-    # No run twice, and as many as trials had seeds.
-    assert len(set(map(tuple, jobs))) == len(jobs) == sum(len(t.user_attrs["values"]) for t in study.trials)
+    assert (len(states), states.count("FAIL")) == (24, 0)
+    cut = [trial for trial in study.trials if trial.state.name == "PRUNED"]
+    # No run twice; those that were cut short were stopped, and only those.
+    assert len(set(jobs)) == len(jobs)
+    steps = [trial.user_attrs["cut"]["step"] for trial in cut]
+    assert min(steps) == 300
+    assert len(steps) > 5
+    # The tenth is no border of a seed: all were stopped on the way but those that ended right there.
+    assert len(search.trainings.cuts) == sum(step < 1000 for step in steps) > 5
+    for trial in cut:
+        where = trial.user_attrs["cut"]
+        assert max(trial.intermediate_values) == 10 * (where["seed"] - 1) + where["step"] // 100
+    assert not [
+        trial for trial in study.trials if trial.state.name == "COMPLETE" and len(trial.intermediate_values) != 30
+    ]
     said = capsys.readouterr().out
-    assert said.count("no more seeds") == states.count("PRUNED")
+    assert said.count("cut short: worse than the median at seed ") == len(cut)
     page = (tmp_path / "it" / "search.md").read_text()
-    assert f"{states.count('COMPLETE')} trials are complete, {states.count('PRUNED')} were cut short" in page
+    assert f"{states.count('COMPLETE')} trials are complete, {len(cut)} were cut short" in page
+    rows = page.split("## Cut short\n")[1].split("\n## ")[0]
+    for where in (trial.user_attrs["cut"] for trial in cut):
+        assert f"| {where['seed']} | {where['step']:,} | 1,000 | {where['worth']:,.6g} |" in rows
+    assert rows.count("\n| ") == len(cut) + 1
     assert space.command(study.best_params) in page
     assert page.index(f"| {study.best_trial.number} |") == page.index("| ", page.index("|---|"))
     assert "PED-ANOVA): agent.q_lr 100%" in page
@@ -178,24 +149,33 @@ def test_all_seeds_at_once_where_nothing_is_cut_short(tmp_path):
     assert search.run() == 0
     assert len(search.trainings.jobs) == 12
     assert search._abreast == 2
+    assert reports(tmp_path / "it") == []
+    assert search.trainings.cuts == []
 
 
 def test_it_goes_on_where_it_was_and_further(tmp_path, capsys):
     class Ends(Formula):
-        def train(self, jobs):
-            if len(self.jobs) >= 5:
-                return [None] * len(jobs), 128 + signal.SIGINT
-            return super().train(jobs)
+        def run(self, look):
+            while look() and len(self.jobs) < 7:
+                self.at = {job: tenth + 1 for job, tenth in self.at.items()}
+            return 128 + signal.SIGINT
 
     space = spaced(RATE, "seed=1,2")
     first = searched(tmp_path / "it", space, 6, train=Ends())
     assert first.run() == 130
     assert "stopped by SIGINT; to go on: " in capsys.readouterr().out
+    # As a kill in the middle of writing leaves it.
+    journal = tmp_path / "it" / "study.log"
+    (tmp_path / "it" / "study.log.lock").symlink_to("it/study.log")
+    journal.write_bytes(journal.read_bytes() + b'{"op_code":8,"worker')
     second = searched(tmp_path / "it", space, 6)
     assert second.run() == 0
     assert "2 were under way" in capsys.readouterr().out
-    jobs = [tuple(job) for each in (first, second) for job in each.trainings.jobs]
-    assert len(set(jobs)) == len(jobs) <= 12
+    # What was under way is asked for again, and nothing else; and no step is told twice.
+    jobs = [job for each in (first, second) for job in each.trainings.jobs]
+    assert len(jobs) - len(set(jobs)) == 2
+    told = reports(tmp_path / "it")
+    assert len(set(told)) == len(told) > 60
     third = searched(tmp_path / "it", space, 6)
     assert (third.run(), third.trainings.jobs) == (0, [])
     assert searched(tmp_path / "it", space, 8).run() == 0
@@ -207,8 +187,11 @@ def test_it_goes_on_where_it_was_and_further(tmp_path, capsys):
 
 def test_it_ends_where_all_trials_fail(tmp_path, capsys):
     class Fails(Formula):
-        def train(self, jobs):
-            return [None for _ in jobs], 1
+        def worth(self, training):
+            return None
+
+        def heights(self, training):
+            return {}
 
     search = searched(tmp_path / "it", spaced(RATE), 40, train=Fails())
     assert search.run() == 1
@@ -216,66 +199,28 @@ def test_it_ends_where_all_trials_fail(tmp_path, capsys):
     assert re.search(r"error: the last \d trials failed; why: ", capsys.readouterr().out)
 
 
-def start(folder, *words: str) -> subprocess.Popen:
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "acmr.app.tune", *words]
-    return subprocess.Popen(
-        command, cwd=folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+def test_a_trial_that_was_to_be_cut_when_the_search_was_killed_is_cut(tmp_path):
+    space = spaced(RATE)
+    first = searched(tmp_path / "it", space, 2)
+    trial = first._study.ask(space.choices)
+    trial.set_user_attr("cut", {"seed": 1, "step": 300, "of": 1000, "worth": 5.0})
+    second = searched(tmp_path / "it", space, 2)
+    assert second.run() == 0
+    assert [trial.state.name for trial in second._study.trials] == ["PRUNED", "COMPLETE"]
+    # No run was begun for it.
+    assert len(second.trainings.jobs) == 1
+    assert second.trainings.cuts == []
 
 
-def test_a_search_that_is_killed_goes_on_with_what_is_there(tmp_path):
-    words = (*TINY, RATE, "agent.tau=0.005,0.05", "seed=1,2", "trials=3", "metric=final_return", "workers=2")
-    search = start(tmp_path, *words)
-    while not list(tmp_path.glob("runs/quick/*/*/summary.json")):
-        assert search.poll() is None, search.communicate()
-        time.sleep(0.1)
-    search.send_signal(signal.SIGKILL)
-    search.communicate()
-    written = {path: path.read_bytes() for path in tmp_path.glob("runs/quick/*/*/summary.json")}
-    said, errors = start(tmp_path, *words).communicate(timeout=500)
-    assert errors == ""
-    assert "going on: " in said
-    (page,) = tmp_path.glob("runs/tune/*/search.md")
-    for path, before in written.items():
-        assert path.read_bytes() == before
-    summaries = list(tmp_path.glob("runs/quick/*/*/summary.json"))
-    assert len(summaries) == 6
-    (best,) = re.findall(r"^best: (.+)$", said, re.M)
-    assert best in page.read_text()
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "run.py"), *best.split(" ", 2)[2].replace("'", "").split(), "plan=true"],
-        cwd=tmp_path, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert "2 runs: 2 done, 0 missing" in done.stdout
-
-
-def test_students_are_searched_after_their_teachers(tmp_path):
-    words = (
-        "transfer=hidden,expand", "seed=1", "trials=2", "metric=area", "workers=2", "profile=quick",
-        "total_timesteps=300", "agent.hidden_sizes=[8,8]", "tracking=off",
-    )  # fmt: skip
-    search = start(tmp_path, *words)
-    said, errors = search.communicate(timeout=500)
-    assert (search.returncode, errors) == (0, ""), said
-    teachers = [path for path in tmp_path.glob("runs/quick/*/seed_1/summary.json") if "-none" in str(path)]
-    assert len(teachers) == 1
-    assert len(list(tmp_path.glob("runs/quick/*/seed_1/summary.json"))) in (2, 3)
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["seed=1,2"], "error: nothing to search: say from what to choose, as in python -m acmr.app.tune"),
-        ([RATE, "trials=none"], "error: trials=none: an integer of at least 1 is needed"),
-        ([RATE, "study=../mine"], "error: study=../mine: the name of a folder is needed"),
-        ([RATE, "agent.q_lrr=1"], "error: agent.q_lrr: no such setting"),
-    ],
-)
-def test_bad_input_is_one_line(words, says, tmp_path):
-    search = start(tmp_path, *TINY, *words)
-    said, errors = search.communicate(timeout=200)
-    assert (search.returncode, said) == (2, "")
-    assert errors.startswith(says)
-    assert errors.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
+def test_a_run_that_another_trial_needs_goes_on(tmp_path):
+    search = searched(tmp_path / "it", spaced("agent.q_lr=1e-3,1e-2"), 4, workers=4)
+    assert search.look()
+    first, second, *others = search._under_way
+    for each in others:
+        each.trainings = {}
+    second.trainings = first.trainings
+    search._cut(first, {"seed": 1, "step": 300, "of": 1000, "worth": 5.0})
+    assert search.trainings.cuts == []
+    search._under_way.remove(first)
+    search._cut(second, {"seed": 1, "step": 300, "of": 1000, "worth": 5.0})
+    assert len(search.trainings.cuts) == 1

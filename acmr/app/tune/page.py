@@ -21,6 +21,8 @@ from acmr.storage.durable import write_bytes
 from analysis.figures.style import COLUMN, apply
 
 PAGE_FILE = "search.md"
+#: What a trial keeps: the values of its runs by seed; and at which seed, step, and of how many steps it was cut short.
+VALUES, CUT = "values", "cut"
 #: Trials in the table, and how many it takes before something can be said of what mattered.
 _SHOWN, _FEWEST = 10, 10
 #: Ratio of the ends of an axis from which there is no room for numbers between powers of ten.
@@ -78,8 +80,8 @@ def _text(name: str, study: optuna.Study, space: Space, metric: str, importance:
         space.command(best.params),
         "```",
         "",
-        f"{counts[TrialState.COMPLETE]} trials are complete, {counts[TrialState.PRUNED]} were cut short because their "
-        f"first seeds were worse than the median of the others', {counts[TrialState.FAIL]} failed.",
+        f"{counts[TrialState.COMPLETE]} trials are complete, {counts[TrialState.PRUNED]} were cut short because they "
+        f"were worse than the median of the others at the same point, {counts[TrialState.FAIL]} failed.",
         "",
         "The best of many is lucky, too: what it is worth says a training with seeds that took no part, as in",
         "",
@@ -95,6 +97,7 @@ def _text(name: str, study: optuna.Study, space: Space, metric: str, importance:
         f"|---|{'---|' * (len(space.choices) + len(space.seeds) + 1)}",
         *(_row(trial, space) for trial in _sorted(trials, metric)[:_SHOWN]),
         "",
+        *_cut_short(trials, space),
         "## What was chosen from",
         "",
         *(f"- {line}" for line in space.lines()),
@@ -127,13 +130,13 @@ def _complete(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
 
 
 def _value(trial: FrozenTrial) -> float:
-    """Its mean, of those seeds that it got."""
-    return float(trial.value if trial.value is not None else list(trial.intermediate_values.values())[-1])
+    """Its mean over the seeds; of one that was cut short that of what it had come to."""
+    return float(trial.value if CUT not in trial.user_attrs else trial.user_attrs[CUT]["worth"])
 
 
 def _row(trial: FrozenTrial, space: Space) -> str:
     chosen = [word.partition("=")[2] for word in space.words(trial.params)]
-    values = trial.user_attrs["values"]
+    values = trial.user_attrs[VALUES]
     cells = [
         str(trial.number),
         *chosen,
@@ -141,6 +144,29 @@ def _row(trial: FrozenTrial, space: Space) -> str:
         f"{_value(trial):,.6g}",
     ]
     return f"| {' | '.join(cells)} |"
+
+
+def _cut_short(trials: Sequence[FrozenTrial], space: Space) -> list[str]:
+    cut = [trial for trial in trials if CUT in trial.user_attrs]
+    if not cut:
+        return []
+    return [
+        "## Cut short",
+        "",
+        f"| trial | {' | '.join(space.choices)} | seed | at step | of | worth there |",
+        f"|---|{'---|' * (len(space.choices) + 4)}",
+        *(_cut_row(trial, space) for trial in cut),
+        "",
+        "Their runs can go on from their checkpoints: the command of one, typed by hand, does that.",
+        "",
+    ]
+
+
+def _cut_row(trial: FrozenTrial, space: Space) -> str:
+    where = trial.user_attrs[CUT]
+    chosen = [word.partition("=")[2] for word in space.words(trial.params)]
+    numbers = [f"{where[key]:,}" for key in ("step", "of")]
+    return f"| {' | '.join([str(trial.number), *chosen, str(where['seed']), *numbers, f'{_value(trial):,.6g}'])} |"
 
 
 def _importance(study: optuna.Study) -> dict[str, float]:
@@ -158,7 +184,7 @@ def _importance(study: optuna.Study) -> dict[str, float]:
 def _history(trials: Sequence[FrozenTrial], metric: str) -> Figure:
     figure, axes = plt.subplots(figsize=(2 * COLUMN, 2.2))
     complete = _complete(trials)
-    cut = [trial for trial in trials if trial.state == TrialState.PRUNED and trial.intermediate_values]
+    cut = [trial for trial in trials if CUT in trial.user_attrs]
     numbers, values = [trial.number for trial in complete], [_value(trial) for trial in complete]
     best = (np.minimum if metric == STEPS else np.maximum).accumulate(values)
     axes.plot(numbers, best, drawstyle="steps-post", color=_BEST, label="best so far")
