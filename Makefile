@@ -50,9 +50,9 @@ format: $(READY) ## lay out the code
 	ruff check --fix .
 	ruff format .
 
-demo: $(READY) ## the paper's 21 runs on a small robot: minutes; again: only what is missing
-	python run.py matrix=quick output_dir=$(RUNS)
-	@python -m analysis $(RUNS)/quick --out results/quick --if-changed
+demo: $(READY) ## the paper's seven cells and transfer by name on a small robot: minutes; again: only what is missing
+	python run.py matrix=demo output_dir=$(RUNS)
+	@python -m analysis $(RUNS)/demo --out results/demo --if-changed
 
 paper: $(READY) ## the paper's 21 runs, a million steps each, then its tables and figures; a day on 2 cores
 	python run.py matrix=paper output_dir=$(RUNS)

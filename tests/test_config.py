@@ -60,7 +60,7 @@ def test_every_leaf_of_every_group_composes(leaf):
     assert spec(leaf, *needs.get(leaf, [])).config.seed == 1
 
 
-@pytest.mark.parametrize(("profile", "cell"), [*itertools.product(["paper", "quick", "paper_v5"], CELLS)])
+@pytest.mark.parametrize(("profile", "cell"), [*itertools.product(["paper", "quick", "demo", "paper_v5"], CELLS)])
 def test_a_cell_is_what_its_file_says(profile, cell):
     made = spec(f"experiment={cell}", f"profile={profile}")
     row = CELLS[cell]

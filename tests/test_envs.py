@@ -26,6 +26,8 @@ DIMENSIONS = {
     "armless_humanoid_v5": (242, 11),
     "ant": (27, 8),
     "ant_three_legs": (23, 6),
+    "halfcheetah": (17, 6),
+    "lame_halfcheetah": (17, 5),
     "whole_ant": (27, 8),
     "ant_leg_lost": (23, 6),
     "ant_leg_added": (27, 8),

@@ -157,7 +157,7 @@ def test_what_may_be_chosen_is_what_hydra_finds(found: Sources) -> None:
     assert set(groups()) == {
         "agent", "env", "experiment", "freeze", "matrix", "profile", "seeding", "tracking", "transfer",
     }  # fmt: skip
-    assert set(options("matrix")) == {"mine", "paper", "quick", "shifts"}
+    assert set(options("matrix")) == {"demo", "mine", "paper", "quick", "shifts"}
     assert "slow" in options("agent")
     # Hydra's own launchers train no sweep of teachers and students.
     assert launchers() == ["local", "slurm"]

@@ -77,8 +77,8 @@ def test_twelve_students_add_their_three_teachers_and_none_that_is_there(out):
     assert [len(stage) for stage in second.stages] == [12]
 
 
-@pytest.mark.parametrize("matrix", ["paper", "quick"])
-def test_a_matrix_is_the_seven_cells_on_three_seeds_and_its_teachers_are_among_them(matrix, out):
+@pytest.mark.parametrize(("matrix", "more"), [("paper", []), ("quick", []), ("demo", ["N1"])])
+def test_a_matrix_is_the_seven_cells_on_three_seeds_and_its_teachers_are_among_them(matrix, more, out):
     register_schema()
     with initialize_config_dir(str(CONFIG_FOLDER), version_base="1.3"):
         hydra = compose("config", [f"matrix={matrix}"], return_hydra_config=True).hydra
@@ -86,10 +86,10 @@ def test_a_matrix_is_the_seven_cells_on_three_seeds_and_its_teachers_are_among_t
     swept = {key: values.split(",") for key, values in hydra.sweeper.params.items()}
     made = plan(*product(out, f"matrix={matrix}", **swept))
     found = sorted((run.spec.cell, run.spec.config.seed) for run in made.runs)
-    assert found == sorted(itertools.product(CELLS, [1, 2, 3]))
+    assert found == sorted(itertools.product([*CELLS, *more], [1, 2, 3]))
     assert not any(run.implied for run in made.runs)
     assert {run.spec.config.profile for run in made.runs} == {matrix}
-    assert [len(stage) for stage in made.stages] == [6, 15]
+    assert [len(stage) for stage in made.stages] == [6, 15 + 3 * len(more)]
     taken = [made.runs[index].spec.cell for index in made.order]
     assert taken[:3] == ["H0"] * 3
 

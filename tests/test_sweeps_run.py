@@ -164,7 +164,7 @@ def test_a_plan_starts_nothing(out):
     ("words", "says"),
     [
         (["-m", "transfer=hiden,expand"], "did you mean transfer=hidden?"),
-        (["matrix=papr"], "matrix=papr: must be one of paper, quick"),
+        (["matrix=papr"], "matrix=papr: must be one of demo, paper, quick, shifts"),
         (["matrix=quick", "experiment=H0,B7"], "experiment=B7: must be one of A0"),
         (["matrix=quick", "retries=some"], "retries=some: an integer"),
         (["matrix=quick", "workers=0"], "workers=0: an integer"),
