@@ -131,7 +131,8 @@ def _complete(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
 
 def _value(trial: FrozenTrial) -> float:
     """Its mean over the seeds; of one that was cut short that of what it had come to."""
-    return float(trial.value if CUT not in trial.user_attrs else trial.user_attrs[CUT]["worth"])
+    worth = trial.user_attrs[CUT]["worth"] if CUT in trial.user_attrs else trial.value
+    return float("nan") if worth is None else float(worth)
 
 
 def _row(trial: FrozenTrial, space: Space) -> str:

@@ -16,6 +16,7 @@ from hydra.core.override_parser.types import Override
 from optuna.distributions import distribution_to_json
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
+from optuna.study import StudyDirection
 
 from acmr.app.tune.space import METRIC, Space
 from acmr.config import NONE, STEPS, ConfigError, ExperimentConfig, is_neutral
@@ -45,7 +46,7 @@ def open_study(folder: Path, direction: str) -> optuna.Study:
         study = optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(path), lock)),
             study_name=folder.name,
-            direction=direction,
+            direction=StudyDirection[direction.upper()],
             pruner=optuna.pruners.MedianPruner(n_startup_trials=UNPRUNED),
             load_if_exists=True,
         )
