@@ -33,6 +33,8 @@ def test_what_a_curve_says_at_a_tenth_follows_from_the_episodes_up_to_there(metr
 
     rng = np.random.default_rng(1)
     steps = np.cumsum(rng.integers(20, 60, 50))
+    # One that ends at the step itself belongs to it.
+    steps[np.searchsorted(steps, 600)] = 600
     config = replace(parse(compose_config(TINY)), total_timesteps=2000, threshold=9.0, consecutive=3)
     assert (config.most_steps, step_of(3, config), first_judged(config)) == (2000, 600, 3)
     assert first_judged(replace(config, agent=replace(config.agent, learning_starts=700))) == 5
