@@ -129,10 +129,17 @@ def run_name(env: str, transfer: str, freeze: bool, changes: Mapping[str, Any]) 
         changes: All settings, as ``group.key``, in which it differs from its profile's own.
     """
     parts = [re.sub(r"[^A-Za-z0-9_.-]", "_", env), transfer, *(["frozen"] if freeze else [])]
+    rest = _said(without_kind(changes))
+    if len("-".join([*parts, *rest])) <= _LONGEST_NAME:
+        return "-".join([*parts, *_said(changes)])
+    # Where it ends and how it uses its seed stay to be read, so that its kin can be found by their names.
+    kind = {key: value for key, value in changes.items() if key in _OF_NO_CELL}
+    return "-".join([*parts, digest(rest), *_said(kind)])
+
+
+def _said(changes: Mapping[str, Any]) -> list[str]:
     leaves = sorted(((key.split(".")[-1], value) for key, value in changes.items()), key=lambda leaf: leaf[0])
-    said = [f"{key}={_short(value)}" for key, value in leaves]
-    name = "-".join([*parts, *said])
-    return name if len(name) <= _LONGEST_NAME else "-".join([*parts, digest(said)])
+    return [f"{key}={_short(value)}" for key, value in leaves]
 
 
 def without_kind(changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def test_a_checkpoint_depends_on_the_method_in_use_and_on_no_other(folder):
     assert not {name for name in used if name.startswith("acmr.app")}
     named = _program(("acmr.agent.sac", "acmr.transfer.named"))
     more = {line.split()[0] for line in named.decode().splitlines()} - used
-    assert more == {"acmr.transfer.named", "acmr.transfer.name_map"}
+    assert more == {"acmr.transfer.named"}
 
 
 def test_a_checkpoint_depends_on_what_the_user_s_method_does(folder, monkeypatch):

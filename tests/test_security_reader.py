@@ -110,7 +110,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "teacher": load_teacher,
     "settings": lambda run: (RunDir(run).stored_settings(), RunDir(run).summary(), RunDir(run).is_complete()),
     "mirror": lambda run: rebuild(run, "tensorboard", lambda line: None),
-    "publish": lambda run: publishing._files(run, run.parent / "none", run.parent),
+    "publish": lambda run: publishing._files(run, run.parent / "none", run.parent, False),
     "evaluation of a publication": lambda run: publishing._json(run / "evaluation.json"),
     "analysis": read_analysis,
     "status": lambda run: status([str(run.parents[2])]),
