@@ -131,6 +131,19 @@ def test_a_folder_may_have_any_letters(tmp_path: Path) -> None:
         hydra_arguments(["hydra.searchpath=[nowhere]"])
 
 
+@pytest.mark.parametrize(
+    ("word", "allowed"),
+    [
+        ("hydra/launcher=3", "one of local, slurm"),
+        ("hydra/launcher=null", "one of local"),
+        ("hydra/sweeper=0", "a name"),
+    ],
+)
+def test_a_group_of_hydras_is_no_number(word, allowed):
+    with pytest.raises(ConfigError, match=f"^{word}: must be {allowed}"):
+        hydra_arguments([word])
+
+
 #: Starts a program that gets Ctrl-C as it begins to load a module.
 INTERRUPTED = """
 import os, runpy, signal, sys

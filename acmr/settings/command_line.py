@@ -23,6 +23,7 @@ from acmr.settings.compose import (
     as_override,
     check_choices,
     groups,
+    launchers,
     look_in,
     options,
     quote_choice,
@@ -112,6 +113,9 @@ def _in_hydras_words(argument: str) -> str:
         return f"{SEARCH_PATH}={as_override([*dict.fromkeys([*_searched(argument), SWEEPS])])}"
     if _CALL.search(value) and key.lstrip("+") in groups():
         raise ConfigError(f"{key}={value}: is chosen by its name; type one of {', '.join(options(key.lstrip('+')))}")
+    if key.lstrip("+").startswith("hydra/") and _NO_NAME.fullmatch(value):
+        known = f"one of {', '.join(launchers())}" if key.endswith("/launcher") else "a name"
+        raise ConfigError(f"{key}={value}: must be {known}, or left out")
     argument = quote_choice(argument)
     value = argument.partition("=")[2]
     for chosen in value.replace("'", "").split(",") if key in groups() else []:
