@@ -1,5 +1,6 @@
 """Planning: which runs, in which order, and what is refused before anything starts."""
 
+import gc
 import itertools
 import os
 import subprocess
@@ -235,9 +236,14 @@ def test_a_job_file_gives_back_the_run(tmp_path, out):
 def test_planning_costs_less_than_60_ms_a_run(out):
     jobs = product(out, experiment=list(CELLS), seed=[str(seed) for seed in range(20)])
     plan(*jobs[:2])
-    before = time.process_time()
-    assert len(plan(*jobs).runs) == 140
-    assert (time.process_time() - before) / 140 < 0.060
+    # What thousands of tests before it have left in memory is none of its business.
+    gc.freeze()
+    try:
+        before = time.process_time()
+        assert len(plan(*jobs).runs) == 140
+        assert (time.process_time() - before) / 140 < 0.060
+    finally:
+        gc.unfreeze()
 
 
 def test_the_time_needed_comes_from_finished_runs(tmp_path, out):
