@@ -81,9 +81,9 @@ def test_it_is_drawn_and_reported(done):
     assert page.count('title="ant_three_legs-hidden-frozen-q_lr=0.0005/seed_') == 3
     assert "experiment=H0,H1,A0,A1,A2,A3,A4,A5" in page
     # In its own color: raw returns, curve, and the dashed line at its steps to threshold.
-    olive = "stroke: #bcbd22"
-    assert (out / "figure_5.svg").read_text().count(olive) >= 3
-    assert olive not in (out / "figure_4.svg").read_text()
+    navy = "stroke: #000080"
+    assert (out / "figure_5.svg").read_text().count(navy) >= 3
+    assert navy not in (out / "figure_4.svg").read_text()
 
 
 def test_the_tests_that_go_over_every_cell_include_it(done):

@@ -251,7 +251,7 @@ def test_before_learning_a_student_that_gained_sensors_is_its_teacher(tmp_path, 
     played = {row["method"]: float(row["mean_return"]) for row in csv.DictReader((out / ZERO_SHOT).open())}
     teacher = load_teacher(runs / f"{LOST}-none" / "seed_1").build_networks().actor.eval()
     config = environment_config(LOST)
-    told = rollout.play(teacher, config, episodes=play.EPISODES, seed=play.FIRST_SEED, stochastic=True)
+    told = rollout.play(teacher, config, {}, episodes=play.EPISODES, seed=play.FIRST_SEED, stochastic=True)
     expected = round(np.mean([episode.episodic_return for episode in told]), 2)
     assert played.keys() == {"A0", "N0", "N1"}
     assert (played["N0"], played["N1"]) == (expected, expected) != played["A0"]

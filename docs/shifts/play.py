@@ -38,8 +38,9 @@ def zero_shot(pair: str, method: str, seed: int, runs: Path, chosen: str | None)
     config = parse(compose_config([*words, f"output_dir={as_override(str(runs.parent))}"]))
     if chosen is not None:
         config = replace(config, transfer=replace(config.transfer, impute=chosen))
-    actor = prepare(specify(config)).networks.actor.eval()
-    told = play(actor, config.env, episodes=EPISODES, seed=FIRST_SEED, stochastic=True)
+    prepared = prepare(specify(config))
+    actor = prepared.networks.actor.eval()
+    told = play(actor, config.env, prepared.wrapper_states, episodes=EPISODES, seed=FIRST_SEED, stochastic=True)
     return fmean(episode.episodic_return for episode in told)
 
 
