@@ -48,8 +48,9 @@ def test_every_setting_has_a_meaning():
 def test_help_says_what_settings_mean_and_lists_sweeps(tmp_path):
     done = run(tmp_path, str(ROOT / "run.py"), "--help")
     assert done.returncode == 0, done.stderr
+    studies = sorted(path.stem for path in (ROOT / "sweeps" / "matrix").glob("*.yaml"))
     for line in (
-        "matrix=NAME           a whole study: paper, quick",
+        f"matrix=NAME           a whole study: {', '.join(studies)}",
         "workers=N",
         "retries=N",
         "agent.q_lr",
