@@ -31,6 +31,7 @@ WORDS = (
 )
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_bit_for_bit_with_its_statistics(untouched, tmp_path):
     run = Run(tmp_path / "killed", WORDS)
     for step in (55, 123, 188):

@@ -233,6 +233,7 @@ def test_a_job_file_gives_back_the_run(tmp_path, out):
         assert read_job(tmp_path / "job.json") == spec
 
 
+@pytest.mark.slow
 def test_planning_costs_less_than_60_ms_a_run(out):
     jobs = product(out, experiment=list(CELLS), seed=[str(seed) for seed in range(20)])
     plan(*jobs[:2])
