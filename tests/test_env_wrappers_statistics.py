@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -74,19 +75,17 @@ def test_evaluations_act_on_what_was_seen_in_training(taught, capsys):
     played = json.loads((taught / "evaluation.json").read_text())
     told = load_teacher(taught).wrapper_states()["NormalizeObservation"]
     actor, plain = load_teacher(taught).build_networks().actor, make_env(environment_config("ant"))
-    observation, total, ended = plain.reset(seed=5)[0], 0.0, False
+    observation, total, length = plain.reset(seed=5)[0], 0.0, played["each"][0]["episode_length"]
     frames = [observation, observation]
-    while not ended:
+    assert length > 20
+    for _ in range(length):
         seen = [(frame - told["mean"]) / np.sqrt(told["var"] + 1e-8) for frame in frames[-2:]]
         with torch.no_grad():
             action = actor.mode(torch.tensor(np.concatenate(seen), dtype=torch.float32)[None])[0].numpy()
-        observation, reward, terminated, truncated, _ = plain.step(action)
+        observation, reward, *_ = plain.step(action)
         frames.append(observation)
-        total, ended = total + reward, terminated or truncated or len(frames) > 400
-    length = played["each"][0]["episode_length"]
-    assert length <= len(frames) - 2
-    if length == len(frames) - 2:
-        assert played["mean_return"] == pytest.approx(total, rel=1e-3)
+        total += reward
+    assert played["mean_return"] == pytest.approx(total, rel=1e-3)
 
 
 def test_a_loaded_policy_brings_them_along_and_they_stay(taught):
@@ -182,3 +181,19 @@ def test_damaged_statistics_are_one_line(taught, tmp_path, damage, capsys):
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert said.startswith("error: ")
+
+
+def test_two_wrappers_of_a_class_have_names_of_their_own():
+    class My_Count(gym.Wrapper):  # noqa: N801
+        count = 0
+
+        def state_dict(self):
+            return {"count": self.count}
+
+        def load_state_dict(self, state):
+            self.count = state["count"]
+
+    inner = My_Count(gym.make("Pendulum-v1"))
+    outer = My_Count(inner)
+    inner.count, outer.count = 3, 5
+    assert lasting_state(outer) == {"My_Count": {"count": 3}, "My_Count_2": {"count": 5}}

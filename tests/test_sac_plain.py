@@ -135,3 +135,15 @@ def test_what_no_learner_can_is_refused_in_one_line(changes, says):
 def test_the_guide_to_a_loss_of_ones_own(tmp_path):
     said = follow(ROOT / "docs" / "howto-loss.md", copy_checkout(tmp_path / "checkout"))
     assert said.count("complete, ") == 2
+
+
+def test_a_learner_without_thawing_is_refused_where_layers_thaw(monkeypatch):
+    class Own:
+        precisions = ("float32",)
+
+        def __init__(self, networks, config, acting, learning, log_alpha=0.0, device="cpu"): ...
+
+    monkeypatch.setitem(LEARNERS._entries, "own", Own)
+    assert find_learner(SACConfig(name="own")) is Own
+    with pytest.raises(ConfigError, match="agent=own: this learner has no argument thaws"):
+        find_learner(SACConfig(name="own"), thaws=True)

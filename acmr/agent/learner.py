@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from inspect import signature
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -78,8 +79,12 @@ LEARNERS: Registry[type[Learner]] = Registry("agent.name", "acmr.agent")
 learner = LEARNERS.add
 
 
-def find_learner(config: SACConfig) -> Callable[..., Learner]:
+def find_learner(config: SACConfig, thaws: bool = False) -> Callable[..., Learner]:
     """The class that the settings name.
+
+    Args:
+        config: The settings.
+        thaws: Whether it is to let frozen layers learn later, which one of the user's own need not be able to.
 
     Raises:
         ConfigError: If there is none, or if it cannot compute as the settings ask.
@@ -89,6 +94,11 @@ def find_learner(config: SACConfig) -> Callable[..., Learner]:
         raise ConfigError(
             f"agent={config.name} agent.precision={config.precision}: this learner computes in "
             f"{' or '.join(found.precisions)} only; type agent.precision={found.precisions[0]}"
+        )
+    if thaws and "thaws" not in signature(found).parameters:
+        raise ConfigError(
+            f"agent={config.name}: this learner has no argument thaws, so that nothing that is frozen can thaw; "
+            "type freeze=true or freeze=false"
         )
     return found
 

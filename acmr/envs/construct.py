@@ -28,12 +28,11 @@ from acmr.envs.wrappers.partial import near_matches
 from acmr.text import brief, one_line, typed_mapping
 
 #: What MuJoCo says of Gymnasium's own model files, and Gymnasium of its own wrappers, of no use to who runs them.
-_MODEL_REMARK = r"compiler attribute .* is deprecated"
+_MODEL_REMARK, _SPACE_REMARK = r"compiler attribute .* is deprecated", r".*precision lowered by casting"
 #: What dm_control says where there is no screen, of no use to who trains.
 _SCREEN_REMARK = r".*The DISPLAY environment variable is missing"
 #: The package of DeepMind's environments, and which one registers them with Gymnasium.
 _DM_CONTROL, _SHIMMY = "dm_control", "shimmy"
-_SPACE_REMARK = r".*precision lowered by casting"
 
 
 def find_spec(env_id: str) -> EnvSpec:
@@ -104,7 +103,11 @@ def construct(config: EnvConfig, render_mode: str | None = None) -> ConvertedEnv
             raise
         except BaseException as error:
             raise ConfigError(_reason(config, creator, error)) from error
-        env = wrapped(env, config.wrappers)
+        try:
+            env = wrapped(env, config.wrappers)
+        except ConfigError:
+            env.close()
+            raise
     _check_spaces(config.id, env)
     return ConvertedEnv(env, config.id)
 

@@ -67,7 +67,7 @@ def prepare(spec: RunSpec) -> Prepared:
     config = spec.config
     _check_device(config.device)
     tracker_class(config.tracking)
-    learner = find_learner(config.agent)
+    learner = find_learner(config.agent, bool(config.thaw))
     # A name that stands for nothing is no reason to look for a teacher.
     find_method(config.transfer)
     # Before anything else asks for the environment: one of its instances is then tried out for all of them.

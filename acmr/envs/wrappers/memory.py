@@ -7,7 +7,7 @@ what had been seen until then, and with other statistics it is another policy. S
 from __future__ import annotations
 
 import copy
-from collections import deque
+from collections import Counter, deque
 from typing import Any
 
 import gymnasium as gym
@@ -65,11 +65,12 @@ def lasting_layers(env: gym.Env[Any, Any]) -> dict[str, gym.Env[Any, Any]]:
         layers.append(env)
         env = env.env
     found: dict[str, gym.Env[Any, Any]] = {}
+    counts = Counter[str]()
     for layer in reversed(layers):
         if isinstance(layer, Stateful | NormalizeObservation):
             name = type(layer).__name__
-            count = sum(known.split("_")[0] == name for known in found)
-            found[f"{name}_{count + 1}" if count else name] = layer
+            counts[name] += 1
+            found[f"{name}_{counts[name]}" if counts[name] > 1 else name] = layer
     return found
 
 
