@@ -134,6 +134,7 @@ def test_keys_of_an_archive_differ_and_hold_what_they_stand_for(names):
 @settings(deadline=None)
 @given(st.lists(NAMES, min_size=1, max_size=4))
 @example(["=1+1", "@SUM(1)", "-2", "+3", 'a,"b"\r\nc'])
+@example(["0", ';"@', ';""=1', '; "+1'])
 @example(["a;=cmd|' /C calc'!A0", 'x";=1', "a; @SUM(1);-2", "a|+1", "a\t=1", " =1", "\uff1d1+1", "a;\uff20x"])
 def test_csv_gives_the_name_back_and_no_spreadsheet_computes_it(names):
     cells = [csv_cell(name) for name in names]
@@ -144,7 +145,7 @@ def test_csv_gives_the_name_back_and_no_spreadsheet_computes_it(names):
     for sign in ",;|\t":
         for cell in next(csv.reader([text.getvalue()], delimiter=sign)):
             assert not cell.lstrip(" ").startswith(tuple("=+-@\t\r\uff1d\uff0b\uff0d\uff20")), (sign, cell)
-    added = re.compile(r"(^|[;|])'(?= *[=+\-@\uff1d\uff0b\uff0d\uff20])")
+    added = re.compile(r"""(^|[;|])'(?=[ "]*[=+\-@\uff1d\uff0b\uff0d\uff20])""")
     assert [added.sub(r"\1", cell) for cell in cells] == [added.sub(r"\1", terminal(name)) for name in names]
 
 
