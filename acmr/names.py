@@ -18,7 +18,7 @@ _BYTES, _NO_TEXT = range(0xDC80, 0xDD00), 0xDC00
 #: Signs that Markdown, with tables, mathematics and HTML in it, does not leave as they are.
 _MARKDOWN = re.compile(r"[\\`*<>\[\]|&~$]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
 #: What a spreadsheet computes: an equal sign and the like where a cell begins, the wide ones of Chinese and Japanese
-#: included. Where a spreadsheet of another country parts cells the writer quotes nothing, and the quotes that it doubles
+#: included. Where a spreadsheet of another country parts cells the writer quotes nothing, and quotes that it doubles
 #: may be taken for an empty text before the sign.
 _FORMULA = re.compile(r"""(^|[;|])([ "]*[=+\-@\uff1d\uff0b\uff0d\uff20])""")
 _LATEX = {
